@@ -1,0 +1,1 @@
+"""lpv_track_env."""

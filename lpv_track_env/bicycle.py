@@ -1,0 +1,209 @@
+"""The dynamic bicycle: the project's only copy of the vehicle's physics.
+
+`field` is plain arithmetic (+ - *) on its arguments: sines, cosines and the inverse speed come in
+from outside. So the same function runs on floats inside numba, on NumPy arrays, on CasADi symbols
+and on torch tensors; only the few lines that prepare its arguments differ from backend to backend.
+
+Model (kumar2025lpv, section II; state x = [vx, vy, psi, r, X, Y], input u = [a, delta])::
+
+    vx'  = a - mu g - Fyf sin(delta)/m + r vy
+    vy'  = Fyr/m + Fyf cos(delta)/m - r vx
+    psi' = r
+    r'   = (Fyf cos(delta) lf - Fyr lr)/Iz
+    X'   = vx cos(psi) - vy sin(psi)
+    Y'   = vx sin(psi) + vy cos(psi)
+    Fyf  = Caf (delta - (vy + lf r)/vx)
+    Fyr  = Car (-(vy - lr r)/vx)
+
+From 1 m/s upwards (the paper's domain) the field is exactly this. Below, 1/vx is continued by a
+polynomial that keeps the field twice continuously differentiable, finite at standstill and sound in
+reverse, where tyres damp lateral motion as they do forwards: with q(vx) = `inverse_speed` and the
+signed direction s = vx q (exactly 1 from 1 m/s upwards), slip angles are delta s - (vy + lf r) q and
+-(vy - lr r) q, and rolling resistance is mu g s.
+"""
+
+from typing import Any
+
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lpv_track_env.vehicle import VehicleParameters
+from trajectories.compilation import compiled
+
+VX, VY, PSI, YAW_RATE, X, Y = range(6)
+STATE_NAMES = ("vx", "vy", "psi", "r", "X", "Y")
+STATE_SIZE = 6
+ACTION_SIZE = 2
+LOW_SPEED = 1.0
+"""m/s below which 1/|vx| is replaced by a polynomial: the lower end of the paper's speed range."""
+
+
+def inverse_speed_polynomial(ratio: Any, bounded_speed: Any) -> Any:
+    """Continuation q of 1/|vx|, for any backend; equals 1/|vx| exactly where |vx| >= LOW_SPEED.
+
+    `ratio` is min(|vx| / LOW_SPEED, 1) and `bounded_speed` is max(|vx|, LOW_SPEED). Below
+    LOW_SPEED, q = (15 - 10 w^2 + 3 w^4) / (8 LOW_SPEED) meets 1/|vx| with two derivatives.
+    """
+    squared = ratio * ratio
+    return (15.0 - 10.0 * squared + 3.0 * squared * squared) / (8.0 * bounded_speed)
+
+
+def field(
+    vx: Any,
+    vy: Any,
+    r: Any,
+    cos_psi: Any,
+    sin_psi: Any,
+    a: Any,
+    delta: Any,
+    cos_delta: Any,
+    sin_delta: Any,
+    q: Any,
+    mass: Any,
+    yaw_inertia: Any,
+    lf: Any,
+    lr: Any,
+    caf: Any,
+    car: Any,
+    rolling_deceleration: Any,
+) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """Time derivative of [vx, vy, psi, r, X, Y]; `q` is the inverse speed, see the module."""
+    direction = vx * q
+    force_front = caf * (delta * direction - (vy + lf * r) * q)
+    force_rear = car * ((lr * r - vy) * q)
+    lateral_front = force_front * cos_delta
+    return (
+        a - rolling_deceleration * direction - force_front * sin_delta / mass + r * vy,
+        (force_rear + lateral_front) / mass - r * vx,
+        r,
+        (lateral_front * lf - force_rear * lr) / yaw_inertia,
+        vx * cos_psi - vy * sin_psi,
+        vx * sin_psi + vy * cos_psi,
+    )
+
+
+def inverse_speed(vx: Any) -> Any:
+    """q(vx) on floats or NumPy arrays, 1/(m/s): 1/|vx| from LOW_SPEED on, finite below."""
+    speed = np.abs(vx)
+    return inverse_speed_polynomial(
+        np.minimum(speed / LOW_SPEED, 1.0), np.maximum(speed, LOW_SPEED)
+    )
+
+
+def derivative(
+    state: NDArray[np.float64] | Any,
+    action: NDArray[np.float64] | Any,
+    parameters: VehicleParameters,
+) -> NDArray[np.float64]:
+    """Vector field x' = f(x, u) on NumPy arrays.
+
+    Parameters
+    ----------
+    state
+        [vx, vy, psi, r, X, Y], shape (6,) or (6, n); m/s, m/s, rad, rad/s, m, m.
+    action
+        [a, delta], shape (2,) or (2, n); m/s^2, rad (counter-clockwise positive).
+    parameters
+        The vehicle.
+
+    Returns
+    -------
+    NDArray
+        Time derivative, shape (6,) or (6, n).
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong.
+    """
+    x = np.asarray(state, dtype=np.float64)
+    u = np.asarray(action, dtype=np.float64)
+    if x.shape[:1] != (STATE_SIZE,) or u.shape[:1] != (ACTION_SIZE,):
+        raise ValueError(
+            f"state must be (6,) or (6, n) and action (2,) or (2, n): got {x.shape}, {u.shape}"
+        )
+    vx, vy, psi, r, _, _ = x
+    a, delta = u
+    return np.array(
+        np.broadcast_arrays(
+            *field(
+                vx,
+                vy,
+                r,
+                np.cos(psi),
+                np.sin(psi),
+                a,
+                delta,
+                np.cos(delta),
+                np.sin(delta),
+                inverse_speed(vx),
+                *parameters.as_array(),
+            )
+        )
+    )
+
+
+def casadi_derivative(state: Any, action: Any, parameters: VehicleParameters) -> Any:
+    """Vector field on CasADi symbols: state (6, 1), action (2, 1), result (6, 1)."""
+    import casadi as ca
+
+    vx, vy, psi, r, _, _ = ca.vertsplit(state)
+    a, delta = ca.vertsplit(action)
+    return ca.vertcat(
+        *field(
+            vx,
+            vy,
+            r,
+            ca.cos(psi),
+            ca.sin(psi),
+            a,
+            delta,
+            ca.cos(delta),
+            ca.sin(delta),
+            casadi_inverse_speed(vx),
+            *parameters.as_array(),
+        )
+    )
+
+
+def casadi_inverse_speed(vx: Any) -> Any:
+    """q(vx) on CasADi symbols."""
+    import casadi as ca
+
+    speed = ca.fabs(vx)
+    return inverse_speed_polynomial(ca.fmin(speed / LOW_SPEED, 1.0), ca.fmax(speed, LOW_SPEED))
+
+
+def fastest_pole(vx: float, parameters: VehicleParameters) -> float:
+    """Largest magnitude of the lateral dynamics' poles at speed vx and delta = 0, 1/s.
+
+    The poles of the (vy, r) block of A; an explicit integrator's step must resolve it (RK4 is
+    stable up to 2.78 / pole for real poles).
+    """
+    p = parameters
+    q = float(inverse_speed(vx))
+    caf, car = p.front_cornering_stiffness, p.rear_cornering_stiffness
+    lf, lr = p.front_axle_distance, p.rear_axle_distance
+    coupling = caf * lf - car * lr
+    block = np.array(
+        [
+            [-(caf + car) * q / p.mass, -coupling * q / p.mass - vx],
+            [-coupling * q / p.yaw_inertia, -(caf * lf**2 + car * lr**2) * q / p.yaw_inertia],
+        ]
+    )
+    return float(np.abs(np.linalg.eigvals(block)).max())
+
+
+compiled_field = compiled(field)
+compiled_inverse_speed_polynomial = compiled(inverse_speed_polynomial)
+
+
+@compiled
+def compiled_inverse_speed(vx: float) -> float:
+    """q(vx) inside compiled kernels."""
+    speed = abs(vx)
+    value: float = compiled_inverse_speed_polynomial(
+        min(speed / LOW_SPEED, 1.0), max(speed, LOW_SPEED)
+    )
+    return value

@@ -1,0 +1,225 @@
+"""Vehicle parameters, limits and presets, each number with its source."""
+
+import dataclasses
+import difflib
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+GRAVITY = 9.81  # m/s^2
+
+PARAMETER_ORDER = (
+    "mass",
+    "yaw_inertia",
+    "front_axle_distance",
+    "rear_axle_distance",
+    "front_cornering_stiffness",
+    "rear_cornering_stiffness",
+    "rolling_deceleration",
+)
+"""Order of `VehicleParameters.as_array`, and of the last arguments of `bicycle.field`."""
+
+
+@dataclass(frozen=True)
+class VehicleParameters:
+    """A single-track (bicycle) vehicle: physics, actuators and the constraints a controller keeps.
+
+    Parameters
+    ----------
+    name
+        Name of the vehicle, for reports.
+    source
+        Where the numbers come from.
+    mass
+        m, kg.
+    yaw_inertia
+        Iz about the centre of gravity, kg m^2.
+    front_axle_distance, rear_axle_distance
+        lf, lr: centre of gravity to the axles, m.
+    front_cornering_stiffness, rear_cornering_stiffness
+        Caf, Car: lateral force of an axle per slip angle, N/rad.
+    rolling_resistance
+        mu, rolling resistance coefficient (not tyre friction): `a = mu g` holds speed on the flat.
+    max_steering_angle
+        |delta| <= pi/6 rad (kumar2025lpv, constraint table).
+    max_steering_rate
+        rad/s; the paper's pi/300 a step at Ts 0.02 s, kept as a physical rate.
+    acceleration_range
+        Range of the actuator's command a, m/s^2. Wider than `longitudinal_acceleration_range`,
+        because a must also carry rolling resistance and the front tyre's drag.
+    max_jerk
+        m/s^3, bound on da/dt; the paper's 0.1 m/s^2 a step at Ts 0.02 s.
+    longitudinal_acceleration_range
+        Bounds of dvx/dt, m/s^2: -4 and 2 (02: the text of the paper says 2, its derived row 1).
+    speed_range
+        Bounds of vx that a controller keeps, m/s.
+    max_lateral_velocity_ratio
+        |vy| <= ratio vx. For a steady turn it is a limit on curvature, about ratio / lr at low speed.
+    length, width
+        Body, m, for drawing only.
+
+    Raises
+    ------
+    ValueError
+        If a parameter that must be positive is not, or a range is empty or not finite.
+    """
+
+    name: str
+    source: str
+    mass: float
+    yaw_inertia: float
+    front_axle_distance: float
+    rear_axle_distance: float
+    front_cornering_stiffness: float
+    rear_cornering_stiffness: float
+    rolling_resistance: float
+    max_steering_angle: float = math.pi / 6
+    max_steering_rate: float = math.pi / 300 / 0.02
+    acceleration_range: tuple[float, float] = (-5.0, 3.5)
+    max_jerk: float = 0.1 / 0.02
+    longitudinal_acceleration_range: tuple[float, float] = (-4.0, 2.0)
+    speed_range: tuple[float, float] = (1.0, 30.0)
+    max_lateral_velocity_ratio: float = 0.17
+    length: float = 4.5
+    width: float = 1.8
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name.endswith("_range"):
+                ends = tuple(float(end) for end in value)
+                if len(ends) != 2 or not all(map(math.isfinite, ends)) or ends[0] >= ends[1]:
+                    raise ValueError(
+                        f"vehicle {self.name!r}: {field.name} must be two finite numbers, "
+                        f"the lower first, not {value!r}"
+                    )
+                object.__setattr__(self, field.name, ends)
+            elif field.name == "rolling_resistance":
+                if not (math.isfinite(value) and value >= 0):
+                    raise ValueError(
+                        f"vehicle {self.name!r}: {field.name} must be >= 0, not {value!r}"
+                    )
+            elif field.name not in {"name", "source"} and not (math.isfinite(value) and value > 0):
+                raise ValueError(
+                    f"vehicle {self.name!r}: {field.name} must be positive, not {value!r}"
+                )
+
+    @property
+    def wheelbase(self) -> float:
+        """Distance between the axles lf + lr, m."""
+        return self.front_axle_distance + self.rear_axle_distance
+
+    @property
+    def rolling_deceleration(self) -> float:
+        """Deceleration mu g by rolling resistance, m/s^2."""
+        return self.rolling_resistance * GRAVITY
+
+    @property
+    def understeer_gradient(self) -> float:
+        """Steering angle that a steady turn needs beyond L kappa, per lateral acceleration.
+
+        K = m (lr Car - lf Caf) / (L Caf Car), rad s^2/m (Rajamani, Vehicle Dynamics and Control,
+        section 3.3).
+        """
+        caf, car = self.front_cornering_stiffness, self.rear_cornering_stiffness
+        lf, lr = self.front_axle_distance, self.rear_axle_distance
+        return self.mass * (lr * car - lf * caf) / (self.wheelbase * caf * car)
+
+    def as_array(self) -> NDArray[np.float64]:
+        """Physical parameters, shape (7,), in `PARAMETER_ORDER`, as compiled kernels take them."""
+        return np.array([getattr(self, name) for name in PARAMETER_ORDER])
+
+    def replace(self, **changes: object) -> "VehicleParameters":
+        """Return a copy with some parameters changed."""
+        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        return dataclasses.asdict(self)
+
+
+COURSE_CAR = VehicleParameters(
+    name="course-car",
+    source=(
+        "public course material on LPV-MPC with the equations and limits of kumar2025lpv: "
+        "m, Iz, lf, lr, Caf, Car, mu"
+    ),
+    mass=1500.0,
+    yaw_inertia=3000.0,
+    front_axle_distance=2.0,
+    rear_axle_distance=3.0,
+    front_cornering_stiffness=19000.0,
+    rear_cornering_stiffness=33000.0,
+    rolling_resistance=0.02,
+    length=5.8,
+    width=1.9,
+)
+
+M2_MINIBUS = VehicleParameters(
+    name="m2-minibus",
+    source=(
+        "this project's estimate of the M2 minibus (up to 5 t) of kumar2025lpv, "
+        "whose parameters were not published"
+    ),
+    mass=3500.0,
+    yaw_inertia=8000.0,
+    front_axle_distance=1.6,
+    rear_axle_distance=1.7,
+    front_cornering_stiffness=90000.0,
+    rear_cornering_stiffness=110000.0,
+    rolling_resistance=0.02,
+    length=5.5,
+    width=2.0,
+)
+
+VEHICLES: dict[str, VehicleParameters] = {
+    vehicle.name: vehicle for vehicle in (M2_MINIBUS, COURSE_CAR)
+}
+"""Vehicle presets by name."""
+
+
+def load(vehicle: str | Path | VehicleParameters) -> VehicleParameters:
+    """Resolve a preset's name, a JSON file of parameters, or parameters themselves.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name (the message lists the known ones and the nearest) or a bad file.
+    """
+    if isinstance(vehicle, VehicleParameters):
+        return vehicle
+    if str(vehicle) in VEHICLES:
+        return VEHICLES[str(vehicle)]
+    path = Path(vehicle)
+    if path.suffix == ".json":
+        return _read(path)
+    nearest = difflib.get_close_matches(str(vehicle), VEHICLES, n=1, cutoff=0.0)[0]
+    raise ValueError(
+        f"unknown vehicle {str(vehicle)!r}; known: {', '.join(VEHICLES)} (nearest: {nearest}), "
+        "or give a .json file with the fields of VehicleParameters"
+    )
+
+
+def _read(path: Path) -> VehicleParameters:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"cannot read vehicle file {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise ValueError(f"vehicle file {path} is not JSON: {error}") from error
+    if not isinstance(values, dict):
+        raise ValueError(f"vehicle file {path} must hold one JSON object")
+    values = {"name": path.stem, "source": str(path.name), **values}
+    known = {field.name for field in dataclasses.fields(VehicleParameters)}
+    if unknown := sorted(set(values) - known):
+        raise ValueError(
+            f"vehicle file {path}: unknown field {unknown[0]!r}; known: {sorted(known)}"
+        )
+    try:
+        return VehicleParameters(**values)
+    except TypeError as error:
+        raise ValueError(f"vehicle file {path}: {error}") from error

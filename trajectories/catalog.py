@@ -1,0 +1,330 @@
+"""Named trajectories: the paper's six (drivable and raw), analytic shapes, random paths, files."""
+
+import difflib
+import math
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trajectories import shapes
+from trajectories.curvature import PathStatistics, signed_waypoint_curvature
+from trajectories.path import SPACING, ReferencePath
+from trajectories.speed import SpeedLimits, plan_speed
+
+Array = NDArray[np.float64]
+
+KMH = 1.0 / 3.6
+GENERATOR = "segments/1"
+
+
+@dataclass(frozen=True)
+class Published:
+    """A trajectory's specification: its published rows (SI units) and our segments for them."""
+
+    rows: PathStatistics
+    segments: str
+
+
+def _published(
+    speed_kmh: float,
+    acceleration: float,
+    lateral: float,
+    length: float,
+    max_curvature: float,
+    total_curvature: float,
+    segments: str,
+) -> Published:
+    rows = PathStatistics(
+        speed_kmh * KMH, acceleration, lateral, length, max_curvature, total_curvature
+    )
+    return Published(rows, segments)
+
+
+PUBLISHED: dict[str, Published] = {
+    # kumar2025lpv, table of trajectories. Campus blocks, a long fast straight, sharp turns.
+    "T1": _published(
+        50.36, 1.32, 1.10, 783.51, 1.81, 42.57,
+        "S 45 | L 90 r11 | S 40 | R 90 r11 | S 215 | R 90 r13 | S 35 | R 45 r20 | S 25 | L 45 r20 "
+        "| S 30 | L 90 r11 | S 45 | R 90 r11 | S 30 | L 70 r18 | S 35",
+    ),
+    # A quiet loop.
+    "T2": _published(
+        28.05, 2.01, 1.50, 513.17, 2.79, 24.49,
+        "S 50 | R 90 r12 | S 60 | L 45 r30 | S 40 | L 90 r15 | S 60 | R 36 r40 | S 40 | R 90 r10 "
+        "| S 60",
+    ),
+    # A chicane, a hairpin, sweepers.
+    "T3": _published(
+        31.01, 1.51, 1.89, 1033.47, 3.98, 44.35,
+        "S 90 | L 90 r15 | S 70 | R 60 r20 | S 30 | L 60 r20 | S 110 | L 160 r12 | S 120 "
+        "| R 90 r25 | S 60 | R 90 r14 | S 90 | L 85 r22 | S 70",
+    ),
+    # A slow grid of right angles.
+    "T4": _published(
+        23.01, 2.00, 1.20, 500.00, 4.00, 44.00,
+        "S 45 | L 90 r10 | S 18 | R 90 r10 | S 30 | R 90 r10 | S 50 | L 90 r12 | S 25 | L 90 r10 "
+        "| S 30 | R 90 r11 | S 20 | R 90 r15 | S 40",
+    ),
+    # A test track with prolonged bends.
+    "T5": _published(
+        38.59, 1.85, 1.56, 2119.60, 4.00, 45.00,
+        "S 260 | L 190 r42 | S 180 | R 180 r38 | S 260 | R 75 r60 | S 130 | L 110 r30 | S 220 "
+        "| R 90 r16 | S 240",
+    ),
+    # A ring road, prolonged bends at the lateral limit.
+    "T6": _published(
+        28.12, 1.86, 2.00, 1959.30, 2.00, 20.00,
+        "S 380 | L 110 r27 | S 420 | L 60 r120 | S 250 | R 70 r26 | S 420 | L 46.5 r30 | S 250",
+    ),
+}  # fmt: skip
+"""The paper's six trajectories; the segments are this project's, the paths were not published."""
+
+ANALYTIC = ("straight", "circle", "figure-eight", "double-lane-change", "sine", "u-turn")
+SHAPE_LIMITS = SpeedLimits(
+    max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5, end_speed=3.0
+)
+
+
+def names() -> list[str]:
+    """Names that `load` knows; `random-SEED` stands for any non-negative integer seed."""
+    return [*PUBLISHED, *(f"{name}-raw" for name in PUBLISHED), *ANALYTIC, "random-SEED"]
+
+
+def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
+    """Resolve a name, a file (native CSV, racetrack CSV, x,y CSV, GPS log) or a path itself.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name (the message lists the known ones and the nearest) or a bad file.
+    """
+    if isinstance(trajectory, ReferencePath):
+        return trajectory
+    name = str(trajectory)
+    if name in PUBLISHED:
+        return _drivable(name)
+    if name.endswith("-raw") and name[:-4] in PUBLISHED:
+        return _raw(name[:-4])
+    if name in ANALYTIC:
+        return _analytic(name)
+    if name.startswith("random-") and name[7:].isdecimal():
+        return random_path(int(name[7:]))
+    if name.endswith(".csv") or Path(name).is_file():
+        from trajectories.files import read
+
+        return read(Path(name))
+    nearest = difflib.get_close_matches(name, names(), n=1, cutoff=0.0)[0]
+    raise ValueError(
+        f"unknown trajectory {name!r}; known: {', '.join(names())} (nearest: {nearest}), "
+        "or give a .csv file"
+    )
+
+
+def limits_of(rows: PathStatistics) -> SpeedLimits:
+    """Speed limits that make a profile reach published rows."""
+    return SpeedLimits(
+        max_speed=rows.max_speed,
+        max_lateral_acceleration=rows.max_lateral_acceleration,
+        max_acceleration=rows.max_acceleration,
+    )
+
+
+def from_geometry(
+    geometry: shapes.Geometry,
+    limits: SpeedLimits,
+    name: str,
+    *,
+    closed: bool = False,
+    **metadata: object,
+) -> ReferencePath:
+    """A path with the jerk-limited speed profile that some limits allow on a geometry."""
+    spacing = float(geometry.arc_length[1])
+    speed = plan_speed(geometry.curvature, spacing, limits, closed=closed, share=geometry.share)
+    return ReferencePath(
+        *geometry[:5], speed=speed, name=name, closed=closed,
+        metadata={"limits": asdict(limits), **metadata},
+    )  # fmt: skip
+
+
+@cache
+def _drivable(name: str) -> ReferencePath:
+    published = PUBLISHED[name]
+    limits = limits_of(published.rows)
+    segments = shapes.fit(
+        shapes.parse(published.segments),
+        limits,
+        length=published.rows.length,
+        total_turning=SPACING * published.rows.total_curvature,
+    )
+    return from_geometry(
+        shapes.build(segments), limits, name,
+        source="kumar2025lpv: published rows; segments by lpv-track-env",
+        generator=GENERATOR, segments=published.segments, published=asdict(published.rows),
+    )  # fmt: skip
+
+
+def _kink_curvature(angle: float, spacing: float) -> tuple[float, float]:
+    """Curvature at a kink, and summed over it and its neighbours, by `waypoint_curvature`."""
+    half = 0.5 * angle
+    top = math.sin(half) / (spacing * math.cos(half) ** 2)
+    return top, top + math.sin(angle) / (2.0 * spacing)
+
+
+@cache
+def _raw(name: str) -> ReferencePath:
+    """Kinked waypoints whose discrete curvature matches both published curvature rows.
+
+    The drivable path's turns become kinks in their middle, none sharper than the angle whose
+    curvature is the published maximum; the first of the sharpest turn has just that angle, and all
+    others share one factor that makes the sum of |kappa_i| the published total.
+    """
+    from scipy.optimize import brentq
+
+    rows, drivable = PUBLISHED[name].rows, _drivable(name)
+    counts = int(round(rows.length / SPACING))
+    spacing = rows.length / counts
+    sharpest = brentq(
+        lambda d: _kink_curvature(d, spacing)[0] - rows.max_curvature, 1e-3, 0.9 * math.pi
+    )
+    turns, places = [], []
+    turning = np.flatnonzero(np.abs(drivable.curvature) > 1e-9)
+    for run in np.split(turning, np.flatnonzero(np.diff(turning) > 1) + 1):
+        angle = float(drivable.heading[run[-1]] - drivable.heading[run[0]])
+        parts = max(int(math.ceil(abs(angle) / (0.98 * sharpest))), 1)
+        for part in range(parts):
+            turns.append(angle / parts)
+            places.append(run[0] + (part + 0.5) / parts * (run[-1] - run[0]))
+    top = int(np.argmax(np.abs(turns)))
+
+    def kinks(factor: float) -> list[float]:
+        scaled = [factor * turn for turn in turns]
+        scaled[top] = math.copysign(sharpest, turns[top])
+        return scaled
+
+    def excess(factor: float) -> float:
+        total = sum(_kink_curvature(abs(kink), spacing)[1] for kink in kinks(factor))
+        return total - rows.total_curvature
+
+    angles = kinks(float(brentq(excess, 0.05, 1.02)))
+    corners = [0, *np.rint(np.array(places)).astype(int), counts]
+    x, y = shapes.polyline(angles, np.diff(corners))
+    x, y = x * spacing, y * spacing
+    return _kinked(x, y, spacing, name)
+
+
+def _kinked(x: Array, y: Array, spacing: float, name: str) -> ReferencePath:
+    """A raw path: headings and curvature by central differences, speed that a vehicle can drive."""
+    rows = PUBLISHED[name].rows
+    dx, dy = np.gradient(x), np.gradient(y)
+    heading = np.unwrap(np.arctan2(dy, dx))
+    # A kink spread over 12 m by a Hann window: what a vehicle's own turning makes of it.
+    window = np.hanning(2 * int(round(6.0 / spacing)) + 1)
+    turning = np.gradient(heading, spacing)
+    effective = np.convolve(turning, window / window.sum(), mode="same")
+    limits = limits_of(rows)
+    return ReferencePath(
+        arc_length=np.linspace(0.0, rows.length, len(x)),
+        x=x, y=y, heading=heading, curvature=signed_waypoint_curvature(x, y),
+        speed=plan_speed(effective, spacing, limits),
+        name=f"{name}-raw",
+        metadata={
+            "source": f"kinked waypoints matching both curvature rows of {name} in kumar2025lpv",
+            "generator": GENERATOR, "published": asdict(rows), "limits": asdict(limits),
+            "warnings": [
+                "curvature at the kinks is beyond every vehicle's: the speed follows the turning "
+                "averaged over 12 m, not the kinks"
+            ],
+        },
+    )  # fmt: skip
+
+
+@cache
+def _analytic(name: str) -> ReferencePath:
+    closed = False
+    if name == "straight":
+        geometry = shapes.build(shapes.parse("S 200"))
+    elif name == "u-turn":
+        segments = shapes.parse("S 40 | L 180 r10 | S 40")
+        geometry = shapes.build(shapes.fit(segments, SHAPE_LIMITS))
+    elif name == "circle":
+        geometry, closed = shapes.parametric(_circle, 2.0 * math.pi), True
+    elif name == "figure-eight":
+        geometry, closed = shapes.parametric(_figure_eight, 2.0 * math.pi), True
+    elif name == "sine":
+        geometry = shapes.parametric(_sine, 160.0)
+    else:
+        geometry = shapes.parametric(_double_lane_change, 165.0)
+    return from_geometry(geometry, SHAPE_LIMITS, name, closed=closed, source=f"analytic: {name}")
+
+
+def _circle(t: Array) -> tuple[Array, ...]:
+    radius = 30.0
+    x, y = radius * np.sin(t), radius * (1.0 - np.cos(t))
+    return x, y, radius * np.cos(t), radius * np.sin(t), -radius * np.sin(t), radius * np.cos(t)
+
+
+def _figure_eight(t: Array) -> tuple[Array, ...]:
+    """Gerono's lemniscate, 80 m by 40 m, crossing itself at the origin."""
+    a = 40.0
+    x, y = a * np.sin(t), 0.5 * a * np.sin(2.0 * t)
+    return x, y, a * np.cos(t), a * np.cos(2.0 * t), -x, -4.0 * y
+
+
+def _sine(t: Array) -> tuple[Array, ...]:
+    """Amplitude 2 m, period 40 m over 160 m."""
+    amplitude, k = 2.0, 2.0 * math.pi / 40.0
+    sine, cosine = np.sin(k * t), np.cos(k * t)
+    return (
+        t, amplitude * sine, np.ones_like(t), amplitude * k * cosine,
+        np.zeros_like(t), -amplitude * k * k * sine,
+    )  # fmt: skip
+
+
+def _double_lane_change(t: Array) -> tuple[Array, ...]:
+    """Centre line of ISO 3888-1's course: 15 m, 30 m across, 25 m, 25 m back, then straight.
+
+    The offset of 3.5 m is the lanes' width in the standard; the ramps are quintic (smoothstep of
+    second order), so curvature is continuous. 20 m of run-up and a straight exit are added.
+    """
+    offset, up, down = 3.5, (35.0, 65.0), (90.0, 115.0)
+    y, dy, ddy = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
+    for (begin, end), sign in ((up, 1.0), (down, -1.0)):
+        span = end - begin
+        u = ((t - begin) / span).clip(0.0, 1.0)
+        y += sign * offset * u**3 * (10.0 + u * (6.0 * u - 15.0))
+        dy += sign * offset * 30.0 * u**2 * (1.0 - u) ** 2 / span
+        ddy += sign * offset * 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) / span**2
+    return t, y, np.ones_like(t), dy, np.zeros_like(t), ddy
+
+
+def random_path(seed: int | np.random.Generator, *, length: float | None = None) -> ReferencePath:
+    """A drivable random path: turns of 9 to 60 m radius between straights, for training.
+
+    The same seed gives the same path. Speed limits are drawn too: 6 to 14 m/s, 1.0 to 2.0 m/s^2
+    laterally, 1.3 to 2.0 m/s^2 longitudinally. `length` (m) is drawn from 300 to 600 unless given.
+    """
+    rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
+    name = "random" if isinstance(seed, np.random.Generator) else f"random-{seed}"
+    limits = SpeedLimits(
+        max_speed=float(rng.uniform(6.0, 14.0)),
+        max_lateral_acceleration=float(rng.uniform(1.0, 2.0)),
+        max_acceleration=float(rng.uniform(1.3, 2.0)),
+    )
+    wanted = float(rng.uniform(300.0, 600.0)) if length is None else length
+    segments = [shapes.Segment(length=float(rng.uniform(20.0, 50.0)))]
+    planned = segments[0].length
+    while planned < wanted:
+        radius = float(np.exp(rng.uniform(np.log(9.0), np.log(60.0))))
+        angle = math.radians(float(rng.uniform(20.0, 110.0 if radius > 12.0 else 95.0)))
+        turn = shapes.Segment(turn=float(rng.choice([-1.0, 1.0])) * angle, radius=radius)
+        straight = shapes.Segment(length=float(np.exp(rng.uniform(np.log(8.0), np.log(120.0)))))
+        segments += [turn, straight]
+        planned = sum(part.length for part in shapes.fit(segments, limits))
+    return from_geometry(
+        shapes.build(shapes.fit(segments, limits)), limits, name,
+        source=f"random segments, seed {seed}" if name != "random" else "random segments",
+        generator=GENERATOR,
+    )  # fmt: skip

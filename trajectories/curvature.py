@@ -1,0 +1,133 @@
+"""Curvature: the paper's discrete formula, path statistics, and bands of sharpness."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from trajectories.path import ReferencePath
+
+Array = NDArray[np.float64]
+
+
+def waypoint_curvature(x: ArrayLike, y: ArrayLike) -> Array:
+    """Unsigned curvature |x'y'' - y'x''| / (x'^2 + y'^2)^(3/2) of waypoints, (n,) -> (n,), 1/m.
+
+    kumar2025lpv, evaluated as its figures suggest: central differences, taken twice. At a kink of
+    angle D between waypoints a distance d apart it gives sin(D/2) / (d cos^2(D/2)) at the kink and
+    sin(D) / (4 d) at both neighbours.
+    """
+    return np.abs(signed_waypoint_curvature(x, y))
+
+
+def signed_waypoint_curvature(x: ArrayLike, y: ArrayLike) -> Array:
+    """`waypoint_curvature` with its sign, positive to the left."""
+    dx, dy = np.gradient(np.asarray(x, dtype=np.float64)), np.gradient(np.asarray(y, dtype=float))
+    ddx, ddy = np.gradient(dx), np.gradient(dy)
+    curvature: Array = (dx * ddy - dy * ddx) / (dx * dx + dy * dy) ** 1.5
+    return curvature
+
+
+def circle_curvature(x: ArrayLike, y: ArrayLike) -> Array:
+    """Signed curvature of the circle through each point and its neighbours (Menger), (n,), 1/m.
+
+    4 area / (product of the sides); the ends repeat their neighbours' values.
+    """
+    points = np.column_stack([np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)])
+    before, after = points[1:-1] - points[:-2], points[2:] - points[1:-1]
+    across = points[2:] - points[:-2]
+    doubled = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    sides = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    inner = 2.0 * doubled / np.maximum(sides * np.linalg.norm(across, axis=1), 1e-12)
+    return np.concatenate([inner[:1], inner, inner[-1:]])
+
+
+@dataclass(frozen=True)
+class PathStatistics:
+    """The rows of the paper's trajectory table, SI units."""
+
+    max_speed: float
+    max_acceleration: float
+    max_lateral_acceleration: float
+    length: float
+    max_curvature: float
+    total_curvature: float
+
+
+def statistics(path: ReferencePath) -> PathStatistics:
+    """Rows of the paper's trajectory table that a path achieves.
+
+    Total curvature is the literal sum of |kappa_i| over waypoints 0.25 m apart, as read in the
+    project's errata.
+    """
+    curvature = np.abs(path.curvature)
+    return PathStatistics(
+        max_speed=float(path.speed.max()),
+        max_acceleration=float(path.acceleration.max()),
+        max_lateral_acceleration=float((path.speed**2 * curvature).max()),
+        length=path.length,
+        max_curvature=float(curvature.max()),
+        total_curvature=float(curvature.sum()),
+    )
+
+
+@dataclass(frozen=True)
+class CurvatureBands:
+    """Bands of sharpness on |kappa|: band k lies between thresholds k - 1 and k.
+
+    Parameters
+    ----------
+    thresholds
+        Increasing, 1/m. The default's 0.005, 0.02 and 0.05 are 1.1, 4.6 and 11.3 degrees of
+        steering at a wheelbase of 4 m.
+    names
+        One more than thresholds.
+    hysteresis
+        Share of a threshold by which |kappa| must fall below it before the band is left downwards.
+
+    Raises
+    ------
+    ValueError
+        If thresholds do not increase from above 0, or the names do not fit.
+    """
+
+    thresholds: tuple[float, ...] = (0.005, 0.02, 0.05)
+    names: tuple[str, ...] = ("straight", "gentle", "moderate", "sharp")
+    hysteresis: float = 0.2
+
+    def __post_init__(self) -> None:
+        edges = (0.0, *self.thresholds)
+        if any(b <= a for a, b in zip(edges, edges[1:], strict=False)):
+            raise ValueError(f"thresholds must increase from above 0: {self.thresholds}")
+        if len(self.names) != len(self.thresholds) + 1:
+            raise ValueError(
+                f"{len(self.thresholds)} thresholds need {len(self.thresholds) + 1} names"
+            )
+        if not 0.0 <= self.hysteresis < 1.0:
+            raise ValueError(f"hysteresis must be in [0, 1), not {self.hysteresis}")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def classify(self, curvature: ArrayLike) -> NDArray[np.intp]:
+        """Band index of each |curvature|, shaped like the input; no hysteresis."""
+        return np.searchsorted(np.asarray(self.thresholds), np.abs(curvature), side="right")
+
+    def select(self, curvature: Sequence[float] | Array, current: int | None = None) -> int:
+        """Band of the sharpest |curvature| in a preview, with hysteresis against leaving `current`.
+
+        Upwards a threshold acts at once; downwards only once |kappa| is below it by the share
+        `hysteresis`, so a preview that hovers around a threshold does not flicker.
+        """
+        sharpest = float(np.max(np.abs(curvature))) if np.size(curvature) else 0.0
+        band = int(self.classify(sharpest))
+        if current is None or band >= current:
+            return band
+        held = int(self.classify(sharpest / (1.0 - self.hysteresis)))
+        return max(band, min(held, current))
+
+    def shares(self, path: ReferencePath) -> Array:
+        """Share of a path's length in each band, (len(self),)."""
+        counts = np.bincount(self.classify(path.curvature), minlength=len(self))
+        return counts / counts.sum()

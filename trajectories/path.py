@@ -1,0 +1,239 @@
+"""The reference path: geometry and speed over arc length, sampled, projected on and previewed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from trajectories import projection
+
+SPACING = 0.25
+"""m, the grid of arc length that every path is kept on (up to fitting its length exactly)."""
+MINIMUM_POINTS = 4
+MINIMUM_SPEED = 0.05
+
+Array = NDArray[np.float64]
+
+
+class PathSample(NamedTuple):
+    """A path's quantities at some arc lengths, each shaped like the arc length asked for."""
+
+    x: Array
+    y: Array
+    heading: Array
+    curvature: Array
+    speed: Array
+    acceleration: Array
+    time: Array
+
+
+class Projection(NamedTuple):
+    """Foot point of a position on a path."""
+
+    arc_length: float
+    lateral_error: float
+    heading: float
+    curvature: float
+
+
+class Preview(NamedTuple):
+    """What the reference does over the next periods of its own time, see `ReferencePath.preview`."""
+
+    curvature: Array
+    speed: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePath:
+    """A planar reference path with a speed profile, on a uniform grid of arc length.
+
+    Parameters
+    ----------
+    arc_length
+        (n,) m, from 0, uniform.
+    x, y
+        (n,) m.
+    heading
+        (n,) rad, counter-clockwise from x, unwrapped.
+    curvature
+        (n,) 1/m, signed, positive to the left.
+    speed
+        (n,) m/s along the tangent.
+    name
+        Name for reports.
+    closed
+        Whether the end joins the start (the last node repeats the first, heading up to whole turns).
+    metadata
+        Plain JSON values: source, published and achieved rows, limits used, warnings.
+
+    Raises
+    ------
+    ValueError
+        For fewer than 4 points, unequal lengths, a value that is not finite (with its column and
+        index), arc length that does not start at 0, increase and stay uniform, or speed <= 0.05 m/s.
+    """
+
+    arc_length: Array
+    x: Array
+    y: Array
+    heading: Array
+    curvature: Array
+    speed: Array
+    name: str = "path"
+    closed: bool = False
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        columns = ("arc_length", "x", "y", "heading", "curvature", "speed")
+        n = np.size(self.arc_length)
+        if n < MINIMUM_POINTS:
+            raise ValueError(
+                f"path {self.name!r}: {n} points, at least {MINIMUM_POINTS} are needed"
+            )
+        for column in columns:
+            values = np.array(getattr(self, column), dtype=np.float64)
+            if values.shape != (n,):
+                raise ValueError(
+                    f"path {self.name!r}: {column} has shape {values.shape}, not ({n},)"
+                )
+            if not np.isfinite(values).all():
+                index = int(np.flatnonzero(~np.isfinite(values))[0])
+                raise ValueError(f"path {self.name!r}: {column}[{index}] is {values[index]}")
+            values.flags.writeable = False
+            object.__setattr__(self, column, values)
+        steps = np.diff(self.arc_length)
+        if (steps <= 0).any():
+            index = int(np.flatnonzero(steps <= 0)[0]) + 1
+            raise ValueError(f"path {self.name!r}: arc_length does not increase at index {index}")
+        uneven = np.abs(steps - self.spacing) > 1e-6 * self.spacing + 1e-9 * self.arc_length[-1]
+        if abs(self.arc_length[0]) > 1e-9 or uneven.any():
+            raise ValueError(
+                f"path {self.name!r}: arc_length must start at 0 and be uniform "
+                f"(index {int(np.argmax(uneven)) + 1} is not)"
+            )
+        if (self.speed < MINIMUM_SPEED).any():
+            index = int(np.argmin(self.speed))
+            raise ValueError(
+                f"path {self.name!r}: speed[{index}] is {self.speed[index]} m/s, "
+                f"at least {MINIMUM_SPEED} is needed"
+            )
+
+    @property
+    def length(self) -> float:
+        """Length, m."""
+        return float(self.arc_length[-1])
+
+    @property
+    def spacing(self) -> float:
+        """Distance of nodes along the path, m."""
+        return self.length / (len(self.arc_length) - 1)
+
+    @cached_property
+    def time(self) -> Array:
+        """(n,) time at which the reference passes each node, s; acceleration constant in a cell."""
+        steps = 2.0 * self.spacing / (self.speed[1:] + self.speed[:-1])
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @cached_property
+    def acceleration(self) -> Array:
+        """(n,) tangential acceleration of the cell that follows each node, m/s^2."""
+        cells = np.diff(self.speed**2) / (2.0 * self.spacing)
+        return np.append(cells, cells[0] if self.closed else cells[-1])
+
+    @property
+    def duration(self) -> float:
+        """Time that the reference takes from start to end, s."""
+        return float(self.time[-1])
+
+    @cached_property
+    def table(self) -> Array:
+        """(n, 8) nodes as compiled code takes them, columns as in `trajectories.projection`."""
+        return np.ascontiguousarray(
+            np.column_stack(
+                [
+                    self.x,
+                    self.y,
+                    np.cos(self.heading),
+                    np.sin(self.heading),
+                    self.heading,
+                    self.curvature,
+                    self.speed,
+                    self.time,
+                ]
+            )
+        )
+
+    def sample(self, s: ArrayLike) -> PathSample:
+        """Interpolate at arc lengths s (m, any shape), wrapped if closed, clamped if open."""
+        s = np.asarray(s, dtype=np.float64)
+        rows = np.empty((s.size, 7))
+        for k, value in enumerate(s.ravel()):
+            arguments = (self.table, self.length, self.closed, float(value))
+            index, _ = projection.cell(float(value), self.length, self.closed, len(self.x))
+            rows[k] = (
+                *projection.position_at(*arguments),
+                projection.heading_at(*arguments),
+                projection.curvature_at(*arguments),
+                projection.speed_at(*arguments),
+                self.acceleration[index],
+                projection.time_at(*arguments),
+            )
+        return PathSample(*(column.reshape(s.shape) for column in rows.T))
+
+    def project(self, x: float, y: float, near: float | None = None) -> Projection:
+        """Foot point of the position (x, y), m.
+
+        With `near` (an arc length, m) only the path within 3 m of it is searched, so the answer
+        stays on the local branch of a path that crosses or approaches itself; without, all of it.
+        The lateral error is positive to the left of the path.
+        """
+        start, window = (0.5 * self.length, self.length) if near is None else (near, 3.0)
+        if near is None and self.closed:
+            window = 0.5 * self.length
+        s, lateral_error, heading, curvature = projection.project(
+            self.table, self.length, self.closed, float(x), float(y), float(start), window
+        )
+        return Projection(s, lateral_error, heading, curvature)
+
+    def arc_length_at(self, time: ArrayLike) -> Array:
+        """Arc length that the reference has reached at some times (s) after its start, m."""
+        times = np.asarray(time, dtype=np.float64)
+        values = [
+            projection.arc_length_at(self.table, self.length, self.closed, float(t), 0)[0]
+            for t in times.ravel()
+        ]
+        return np.array(values).reshape(times.shape)
+
+    def preview(self, s: float, period: float, count: int) -> Preview:
+        """Curvature and speed of the reference over the next `count` periods from arc length s.
+
+        `curvature` (count,): mean signed curvature between successive nodes of the reference's own
+        time grid, 1/m; `speed` (count,): speed at each interval's end, m/s.
+        """
+        curvature, speed = np.empty(count), np.empty(count)
+        projection.preview(
+            self.table, self.length, self.closed, float(s), float(period), curvature, speed
+        )
+        return Preview(curvature, speed)
+
+    def with_speed(self, speed: ArrayLike, **metadata: Any) -> "ReferencePath":
+        """Return the same geometry with another speed profile, a scalar or (n,), m/s."""
+        values = np.broadcast_to(np.asarray(speed, dtype=np.float64), self.arc_length.shape)
+        return replace(self, speed=values, metadata={**self.metadata, **metadata})
+
+    def mirrored(self) -> "ReferencePath":
+        """Return the path reflected at the x axis: left and right exchanged."""
+        return replace(
+            self,
+            y=-self.y,
+            heading=-self.heading,
+            curvature=-self.curvature,
+            name=f"{self.name}-mirrored",
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        cached = {"table", "time", "acceleration"}
+        return {key: value for key, value in self.__dict__.items() if key not in cached}

@@ -1,0 +1,205 @@
+"""Jerk-limited speed profile along a path of given curvature, by sequential linear programming.
+
+With b = v^2 over arc length, acceleration is a = b'/2 and jerk is v a'. Maximising speed under caps
+from lateral acceleration, steering rate and top speed is then linear in b but for the jerk bound
+|a'| <= j b^(-1/2), convex in b on the right: linearised about the last profile it is tightened, so
+every iterate is feasible (Lipp and Boyd, Minimum-time speed optimisation over a fixed path, 2014,
+for the variable b; the jerk bound's linearisation is this project's).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.optimize import linprog
+
+Array = NDArray[np.float64]
+
+GRID = 1.0
+"""m, largest spacing of the linear programmes' grid."""
+ITERATIONS = 6
+MARGIN = 0.96
+"""Share of jerk and steering rate that is used: the grid overshoots by up to 4 %."""
+CHATTER_WEIGHT = 2e-3
+"""Weight of the L1 term on changes of acceleration; without it profiles chatter at the caps."""
+
+
+@dataclass(frozen=True)
+class SpeedLimits:
+    """What the speed profile keeps.
+
+    Parameters
+    ----------
+    max_speed
+        m/s.
+    max_lateral_acceleration, max_acceleration, max_deceleration
+        m/s^2; the deceleration stays below the acceleration, as the paper's tables give one row.
+    max_jerk
+        m/s^3.
+    max_steering_rate
+        rad/s of the kinematic steering angle atan(wheelbase kappa).
+    wheelbase
+        m, of the longest vehicle that the path is designed for.
+    end_speed
+        m/s at both ends of an open path.
+    min_speed
+        m/s to which caps are raised where they are lower: the least speed of the paper's
+        constraint table, so that a kink slows the reference down but never stops it.
+    """
+
+    max_speed: float
+    max_lateral_acceleration: float
+    max_acceleration: float
+    max_deceleration: float | None = None
+    max_jerk: float = 1.0
+    max_steering_rate: float = np.pi / 300 / 0.02
+    wheelbase: float = 5.0
+    end_speed: float = 1.5
+    min_speed: float = 1.0
+
+    @property
+    def deceleration(self) -> float:
+        """Bound on deceleration, m/s^2: 95 % of the acceleration's unless given."""
+        if self.max_deceleration is None:
+            return 0.95 * self.max_acceleration
+        return self.max_deceleration
+
+
+def speed_caps(
+    curvature: Array, spacing: float, limits: SpeedLimits, share: Array | float = 1.0
+) -> Array:
+    """Pointwise bound on speed (n,), m/s: top speed, lateral acceleration, steering rate.
+
+    `share` (n,) or a scalar scales the lateral acceleration that may be used at a point.
+    """
+    bent = np.maximum(np.abs(curvature), 1e-9)
+    lateral = np.sqrt(share * limits.max_lateral_acceleration / bent)
+    steering = np.arctan(limits.wheelbase * curvature)
+    slope = np.maximum(np.abs(np.gradient(steering, spacing)), 1e-12)
+    caps = np.minimum(lateral, MARGIN * limits.max_steering_rate / slope)
+    return np.minimum(limits.max_speed, np.maximum(caps, limits.min_speed))
+
+
+def plan_speed(
+    curvature: Array,
+    spacing: float,
+    limits: SpeedLimits,
+    *,
+    closed: bool = False,
+    share: Array | float = 1.0,
+) -> Array:
+    """Fastest jerk-limited speed profile (n,), m/s, on the grid of `curvature` (n,), 1/m.
+
+    An open path starts and ends at `limits.end_speed`; a closed one is planned over three laps, of
+    which the middle one is kept, so its ends meet.
+
+    Raises
+    ------
+    RuntimeError
+        If the linear programme finds no profile (the message holds the solver's).
+    """
+    if closed:
+        laps = np.concatenate([curvature[:-1], curvature[:-1], curvature])
+        shares = np.broadcast_to(share, curvature.shape)
+        shares = np.concatenate([shares[:-1], shares[:-1], shares])
+        n = len(curvature) - 1
+        speed = plan_speed(laps, spacing, limits, share=shares)[n : 2 * n + 1].copy()
+        speed[-1] = speed[0]
+        return speed
+    caps = speed_caps(curvature, spacing, limits, share)
+    length = spacing * (len(curvature) - 1)
+    cells = max(int(np.ceil(length / GRID)), 8)
+    coarse = np.linspace(0.0, length, cells + 1)
+    fine = np.linspace(0.0, length, len(curvature))
+    # A coarse node takes the least cap of its neighbourhood, so that no cap slips between nodes.
+    reach = int(np.ceil(0.5 * length / cells / spacing))
+    nodes = np.rint(coarse / spacing).astype(int).clip(0, len(caps) - 1)
+    padded = np.pad(caps, reach, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
+    squared = _plan(windows[nodes].min(axis=1) ** 2, length / cells, limits)
+    return np.sqrt(np.minimum(_smooth(squared, fine * (cells / length)), limits.max_speed**2))
+
+
+def _smooth(values: Array, at: Array) -> Array:
+    """Uniform quadratic B-spline with control points `values` (m,) at indices `at` (n,).
+
+    Its slope, the acceleration, is continuous and linear between the midpoints of cells, where the
+    linear programme's is a staircase; it stays within the control points' convex hull.
+    """
+    padded = np.concatenate([[2 * values[0] - values[1]], values, [2 * values[-1] - values[-2]]])
+    node = np.rint(at).astype(int).clip(0, len(values) - 1)
+    u = at - node
+    before, here, after = padded[node], padded[node + 1], padded[node + 2]
+    return 0.5 * (0.5 - u) ** 2 * before + (0.75 - u * u) * here + 0.5 * (0.5 + u) ** 2 * after
+
+
+def _plan(caps: Array, h: float, limits: SpeedLimits) -> Array:
+    """Squared speed (m,) on a grid of spacing h under squared caps (m,)."""
+    m = len(caps)
+    end = min(limits.end_speed**2, float(caps[0]), float(caps[-1]))
+    upper = caps.copy()
+    upper[[0, -1]] = end
+    lower = np.minimum(np.full(m, min(end, 0.25)), upper)
+    lower[[0, -1]] = end
+    # a = D b, shape (m - 1,); change of a = E b, shape (m - 2,)
+    difference = sparse.diags([-0.5 / h, 0.5 / h], [0, 1], shape=(m - 1, m)).tocsr()
+    change = (difference[1:] - difference[:-1]).tocsr()
+    squared = _without_jerk(upper, h, limits)
+    identity = sparse.identity(m - 2, format="csr")
+    nothing = sparse.csr_matrix((m - 1, m - 2))
+    for _ in range(ITERATIONS):
+        inner = np.maximum(squared[1:-1], lower[1:-1])
+        # j h b^(-1/2) linearised at b0: j h (1.5 b0^(-1/2) - 0.5 b0^(-3/2) b)
+        allowed = MARGIN * limits.max_jerk * h
+        constant = 1.5 * allowed * inner**-0.5
+        slope = sparse.diags([0.5 * allowed * inner**-1.5], [1], shape=(m - 2, m)).tocsr()
+        constraints = sparse.vstack(
+            [
+                sparse.hstack([difference, nothing]),
+                sparse.hstack([-difference, nothing]),
+                sparse.hstack([change + slope, 0 * identity]),
+                sparse.hstack([slope - change, 0 * identity]),
+                sparse.hstack([change, -identity]),
+                sparse.hstack([-change, -identity]),
+            ],
+            format="csr",
+        )
+        bounds = np.concatenate(
+            [
+                np.full(m - 1, limits.max_acceleration),
+                np.full(m - 1, limits.deceleration),
+                constant,
+                constant,
+                np.zeros(2 * (m - 2)),
+            ]
+        )
+        weight = np.maximum(squared, end) ** -1.5
+        cost = np.concatenate([-weight, np.full(m - 2, CHATTER_WEIGHT)])
+        result = linprog(
+            cost,
+            A_ub=constraints,
+            b_ub=bounds,
+            bounds=np.column_stack(
+                [np.append(lower, np.zeros(m - 2)), np.append(upper, np.full(m - 2, np.inf))]
+            ),
+            method="highs",
+        )
+        if result.x is None:
+            raise RuntimeError(f"no speed profile found: {result.message}")
+        planned = result.x[:m]
+        moved = float(np.abs(np.sqrt(planned) - np.sqrt(squared)).max())
+        squared = planned
+        if moved < 1e-3:
+            break
+    return squared
+
+
+def _without_jerk(caps: Array, h: float, limits: SpeedLimits) -> Array:
+    """Forward and backward pass under acceleration bounds alone: the first iterate."""
+    squared = caps.copy()
+    for k in range(1, len(squared)):
+        squared[k] = min(squared[k], squared[k - 1] + 2 * limits.max_acceleration * h)
+    for k in range(len(squared) - 2, -1, -1):
+        squared[k] = min(squared[k], squared[k + 1] + 2 * limits.deceleration * h)
+    return squared
