@@ -1,1 +1,20 @@
-"""lpv_track_env."""
+"""A Gymnasium environment of a vehicle (dynamic bicycle) that follows reference paths.
+
+Importing this package registers its Gymnasium ids. Submodules load on first use:
+`lpv_track_env.bicycle.derivative`.
+"""
+
+import importlib
+from types import ModuleType
+
+from lpv_track_env.registration import register
+
+_SUBMODULES = ("bicycle", "env", "kernels", "lpv", "observation", "rendering", "reward", "task", "vehicle")
+
+register()
+
+
+def __getattr__(name: str) -> ModuleType:
+    if name in _SUBMODULES:
+        return importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import linprog
 
+from trajectories.path import ReferencePath
+
 Array = NDArray[np.float64]
 
 GRID = 1.0
@@ -203,3 +205,15 @@ def _without_jerk(caps: Array, h: float, limits: SpeedLimits) -> Array:
     for k in range(len(squared) - 2, -1, -1):
         squared[k] = min(squared[k], squared[k + 1] + 2 * limits.deceleration * h)
     return squared
+
+
+def constant_speed(path: ReferencePath) -> float:
+    """Highest constant speed (m/s) that a path's own limits allow all along it.
+
+    Never below the limits' end speed, so that kinked waypoints are driven at walking pace.
+    """
+    limits = SpeedLimits(**path.metadata["limits"]) if "limits" in path.metadata else None
+    if limits is None:
+        return float(path.speed.min())
+    caps = speed_caps(path.curvature, path.spacing, limits)
+    return max(float(caps.min()), limits.end_speed)

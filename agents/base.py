@@ -1,0 +1,133 @@
+"""The one way to act: `predict`, Stable-Baselines3's policy protocol.
+
+Anything with `predict(observation, state, episode_start, deterministic) -> (action, state)` drives:
+it passes through SB3's `evaluate_policy`, this project's rollouts and its reports. `TrackingAgent`
+makes such an agent from one method that controls a single vehicle.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from lpv_track_env.observation import ObservationLayout, TrackingObservation
+from lpv_track_env.vehicle import VehicleParameters
+from trajectories import ReferencePath
+
+Action = NDArray[np.float32]
+Memory = TypeVar("Memory")
+
+
+class Agent(Protocol):
+    """What everything that drives implements."""
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Action, Any]:
+        """Action(s) [a m/s^2, delta rad] for one observation (size,) or a batch (n, size).
+
+        `state` is what the last call returned (None: the agent's own memory); rows that
+        `episode_start` (n,) marks begin a new episode.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class DrivingTask:
+    """What an agent may know beforehand of what it will drive: the vehicle, periods, bounds.
+
+    `path` is known at design time only, for rules that choose settings from the whole path (the
+    paper's weights); what an agent does from step to step it does on the observation.
+    """
+
+    layout: ObservationLayout
+    vehicle: VehicleParameters
+    control_period: float
+    path: ReferencePath
+
+    @classmethod
+    def of(cls, env: gymnasium.Env[Any, Any]) -> "DrivingTask":
+        """Read it off an environment (wrapped or not).
+
+        Raises
+        ------
+        TypeError
+            If the environment is not one of path tracking.
+        """
+        inner = env.unwrapped
+        try:
+            return cls(inner.layout, inner.vehicle, inner.control_period, inner.path)  # type: ignore[attr-defined]
+        except AttributeError as error:
+            raise TypeError(
+                f"{type(inner).__name__} is not a path tracking environment: {error}"
+            ) from None
+
+
+class TrackingAgent(ABC, Generic[Memory]):
+    """An agent made from `control`, which drives one vehicle on one observation.
+
+    It keeps one memory per row of a batch; rows that `episode_start` marks get a new one. A subclass
+    defines `new_memory` if it remembers anything.
+    """
+
+    def __init__(self, task: DrivingTask) -> None:
+        self.task = task
+        low, high = task.vehicle.acceleration_range
+        limit = task.vehicle.max_steering_angle
+        # The action space's own float32 bounds, so that a clipped action lies in the space.
+        self._low = np.array([low, -limit], dtype=np.float32)
+        self._high = np.array([high, limit], dtype=np.float32)
+        self._memories: list[Memory] = []
+
+    @abstractmethod
+    def control(self, observation: TrackingObservation, memory: Memory) -> tuple[float, float]:
+        """Acceleration (m/s^2) and steering angle (rad) for one observation; may write memory."""
+
+    @abstractmethod
+    def new_memory(self) -> Memory:
+        """Memory of a vehicle at the start of an episode."""
+
+    def reset(self) -> None:
+        """Forget everything: the next call begins new episodes."""
+        self._memories = []
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: list[Memory] | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,  # noqa: ARG002  part of the protocol
+    ) -> tuple[Action, list[Memory]]:
+        """Action (2,) for one observation (size,), or (n, 2) for a batch; and the memories.
+
+        Raises
+        ------
+        ValueError
+            If the observation does not have this agent's layout.
+        """
+        values = np.asarray(observation)
+        rows = np.atleast_2d(values)
+        memories = self._memories if state is None else state
+        if len(memories) != len(rows):
+            memories = [self.new_memory() for _ in rows]
+        if episode_start is not None:
+            started = np.broadcast_to(np.asarray(episode_start, dtype=bool), (len(rows),))
+            memories = [
+                self.new_memory() if begins else memory
+                for begins, memory in zip(started, memories, strict=True)
+            ]
+        if state is None:
+            self._memories = memories
+        actions = np.empty((len(rows), 2), dtype=np.float32)
+        for k, (row, memory) in enumerate(zip(rows, memories, strict=True)):
+            actions[k] = self.control(self.task.layout.unpack(row), memory)
+        np.nan_to_num(actions, copy=False, nan=0.0)
+        np.clip(actions, self._low, self._high, out=actions)
+        return (actions[0] if values.ndim == 1 else actions), memories

@@ -1,0 +1,62 @@
+"""Agents by name; a name's module is imported only when it is made."""
+
+import difflib
+import importlib
+from typing import Any
+
+import gymnasium
+
+from agents.base import Agent, DrivingTask
+
+REGISTRY: dict[str, str] = {
+    "lpv-nmpc-ipopt": "agents.nmpc.agent:IpoptNmpc",
+    "stanley": "agents.geometric:Stanley",
+    "pure-pursuit": "agents.geometric:PurePursuit",
+    "lqr": "agents.lqr:LpvLqr",
+    "pid": "agents.pid:Pid",
+}
+"""Name -> "module:Class"; the class takes a `DrivingTask` and its own keyword settings."""
+
+
+def names() -> list[str]:
+    """Names that `make` knows."""
+    return list(REGISTRY)
+
+
+def agent_class(name: str) -> type[Any]:
+    """Class behind a name, or behind a "module:Class" of the user's own.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name; the message lists the known ones and the nearest.
+    """
+    target = REGISTRY.get(name, name)
+    module, separator, attribute = target.partition(":")
+    if not separator:
+        nearest = difflib.get_close_matches(name, REGISTRY, n=1, cutoff=0.0)[0]
+        raise ValueError(
+            f"unknown agent {name!r}; known: {', '.join(REGISTRY)} (nearest: {nearest}), "
+            "or give your own as module:Class"
+        )
+    try:
+        found: type[Any] = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"agent {name!r} cannot be loaded: {error}") from error
+    return found
+
+
+def make(name: str, env: gymnasium.Env[Any, Any], **settings: Any) -> Agent:
+    """Make an agent for an environment; `settings` are its class's keyword arguments.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name or setting.
+    """
+    cls = agent_class(name)
+    try:
+        agent: Agent = cls(DrivingTask.of(env), **settings)
+    except TypeError as error:
+        raise ValueError(f"agent {name!r}: {error}") from error
+    return agent

@@ -1,0 +1,338 @@
+"""`lpv_track_env/PathTracking-v0`: drive a reference path with acceleration and steering."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from lpv_track_env import kernels, vehicle
+from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.reward import TERMS, RewardWeights
+from lpv_track_env.task import CONDITIONS, Task, choose, reference
+from lpv_track_env.vehicle import VehicleParameters
+from trajectories import ReferencePath
+
+RESET_OPTIONS = (
+    "trajectory",
+    "vehicle",
+    "arc_length",
+    "lateral_error",
+    "heading_error",
+    "speed_error",
+)
+
+
+class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """A vehicle (dynamic bicycle) follows a reference path.
+
+    ## Action space
+
+    `Box(float32, (2,))`, SI units, the command held over one control period:
+
+    | entry | meaning | low | high |
+    |---|---|---|---|
+    | 0 | acceleration command a, m/s^2 | -5 | 3.5 |
+    | 1 | front steering angle delta, rad, left positive | -pi/6 | pi/6 |
+
+    The actuators clip range (the bounds above, of the vehicle) and rate (0.5236 rad/s, 5 m/s^3):
+    `info["clipped"]` holds bits 1 (acceleration range), 2 (its rate), 4 (steering range), 8 (its
+    rate). An action that is not finite, or of the wrong shape or type, is a ValueError and leaves
+    the episode untouched.
+
+    ## Observation space
+
+    `Box(float32, (8 + 2 K,))`: body velocities, yaw rate, actuators, errors and a preview of the
+    reference's curvature and speed over K periods. Every entry, its unit and sign:
+    `lpv_track_env.observation`. Values beyond a bound saturate.
+
+    ## Reward
+
+    Sum of the named terms in `info["reward_terms"]`: progress, lateral, heading, speed, input_rate,
+    end; formulas and default weights in `lpv_track_env.reward`. Perfect tracking gives 1 a second.
+
+    ## Episode end
+
+    `terminated`, with `info["end"]`:
+
+    | end | when |
+    |---|---|
+    | `finished` | the foot point reaches the end of the path (a closed path: after one lap) |
+    | `left_corridor` | lateral error over `max_lateral_error` |
+    | `wrong_heading` | heading error over 90 degrees |
+    | `non_finite` | the state is no longer finite (the last finite one is kept) |
+
+    `truncated`, with `info["end"] = "time_limit"`, by the time limit alone.
+
+    ## Starting state
+
+    On the path at its start, at the reference speed, steering straight. `initial_error_range` draws
+    uniform errors in lateral offset (m), heading (rad) and speed (m/s); `random_start` draws the
+    arc length too. All randomness comes from `self.np_random`.
+
+    `reset(options=...)` takes `trajectory`, `vehicle` (both as in the arguments), `arc_length` (m),
+    `lateral_error` (m), `heading_error` (rad), `speed_error` (m/s); these hold for the episode
+    that begins, and the next reset returns to the constructor's.
+
+    ## Info
+
+    `lateral_error, heading_error, speed_error, arc_length, state` (truth, (6,): vx, vy, psi, r, X,
+    Y), `reward_terms, clipped`, and at the end `end`.
+
+    ## Arguments
+
+    trajectory
+        A name (`trajectories.names()`), a file, or a `ReferencePath`.
+    vehicle
+        A preset's name (`lpv_track_env.vehicle.VEHICLES`), a .json file or `VehicleParameters`.
+    speed_mode, fixed_speed
+        "variable": the path's own speed profile. "fixed": one constant speed in m/s, by default the
+        highest that the path's limits allow everywhere.
+    conditions
+        "simulation": perfect actuators and sensors.
+    control_period
+        s; the dynamics are integrated with fixed Runge-Kutta steps of at most 5 ms within it.
+    preview_steps, preview_period
+        K and the spacing of the preview, s (by default the control period).
+    reward_weights
+        `lpv_track_env.reward.RewardWeights`.
+    max_lateral_error
+        Half width of the corridor, m.
+    time_limit
+        s; by default one and a half times the path's duration plus 10 s.
+
+    ## Version history
+
+    v0: first version.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 20,
+    }
+
+    def __init__(
+        self,
+        trajectory: str | Path | ReferencePath = "T1",
+        vehicle: str | Path | VehicleParameters = "m2-minibus",
+        speed_mode: str = "variable",
+        fixed_speed: float | None = None,
+        conditions: str = "simulation",
+        control_period: float = 0.05,
+        render_mode: str | None = None,
+        *,
+        preview_steps: int = 20,
+        preview_period: float | None = None,
+        reward_weights: RewardWeights | None = None,
+        max_lateral_error: float = 5.0,
+        time_limit: float | None = None,
+        initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        random_start: bool = False,
+    ) -> None:
+        if render_mode is not None:
+            choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
+        self.conditions = choose("conditions", conditions, CONDITIONS)
+        self.render_mode = render_mode
+        self._speed = (speed_mode, fixed_speed)
+        self._initial_error_range = tuple(float(value) for value in initial_error_range)
+        if len(self._initial_error_range) != 3 or min(self._initial_error_range) < 0:
+            raise ValueError("initial_error_range must be three numbers >= 0: m, rad, m/s")
+        self._random_start = random_start
+        car = _load_vehicle(vehicle)
+        period = control_period if preview_period is None else preview_period
+        self.base_task = Task(
+            path=reference(trajectory, car, speed_mode, fixed_speed),
+            vehicle=car,
+            control_period=float(control_period),
+            layout=ObservationLayout(preview_steps, float(period)),
+            reward_weights=reward_weights or RewardWeights(),
+            max_lateral_error=float(max_lateral_error),
+            time_limit=time_limit,
+        )
+        self._bound = self.base_task.layout.bound
+        self.observation_space = spaces.Box(-self._bound, self._bound, dtype=np.float32)
+        low, high = car.acceleration_range
+        limit = car.max_steering_angle
+        self.action_space = spaces.Box(
+            np.array([low, -limit], dtype=np.float32), np.array([high, limit], dtype=np.float32)
+        )
+        self._observation = np.zeros(self.base_task.layout.size, dtype=np.float32)
+        self._memory = np.zeros(kernels.MEMORY_SIZE)
+        self._action = np.zeros(2)
+        self._running = False
+        self._renderer: Any = None
+        self._use(self.base_task)
+
+    def _use(self, task: Task) -> None:
+        self.task = task
+        self._constants = task.constants()
+        self._table = task.path.table
+
+    @property
+    def path(self) -> ReferencePath:
+        """The reference path of the current episode."""
+        return self.task.path
+
+    @property
+    def vehicle(self) -> VehicleParameters:
+        """The vehicle of the current episode."""
+        return self.task.vehicle
+
+    @property
+    def control_period(self) -> float:
+        """Control period, s."""
+        return self.task.control_period
+
+    @property
+    def layout(self) -> ObservationLayout:
+        """Layout of the observation vector."""
+        return self.task.layout
+
+    @property
+    def state(self) -> NDArray[np.float64]:
+        """True state [vx, vy, psi, r, X, Y], (6,), a copy."""
+        return self._memory[:6].copy()
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode; see the class for `options`."""
+        super().reset(seed=seed)
+        options = dict(options or {})
+        for key in options:
+            choose("reset option", key, RESET_OPTIONS)
+        self._use(self._episode_task(options))
+        length = self.task.path.length
+        if self._random_start:
+            share = 1.0 if self.task.path.closed else 0.8
+            arc_length = float(self.np_random.uniform(0.0, share * length))
+        else:
+            arc_length = 0.0
+        errors = [
+            float(self.np_random.uniform(-half, half)) if half > 0 else 0.0
+            for half in self._initial_error_range
+        ]
+        arc_length = _number(options, "arc_length", arc_length)
+        if not 0.0 <= arc_length <= length:
+            raise ValueError(f"option arc_length must be in [0, {length:.2f}] m, not {arc_length}")
+        for k, key in enumerate(("lateral_error", "heading_error", "speed_error")):
+            errors[k] = _number(options, key, errors[k])
+        self._memory[:] = self.task.initial_memory(arc_length, (errors[0], errors[1], errors[2]))
+        kernels.start(
+            self._memory, self._constants, self._table, self._bound, self._observation
+        )
+        self._running = True
+        if self._renderer is not None:
+            self._renderer.begin(self.task)
+        if self.render_mode == "human":
+            self.render()
+        return self._observation.copy(), self._info()
+
+    def _episode_task(self, options: Mapping[str, Any]) -> Task:
+        if not {"trajectory", "vehicle"} & set(options):
+            return self.base_task
+        car = _load_vehicle(options.get("vehicle", self.base_task.vehicle))
+        path = self.base_task.path
+        if "trajectory" in options:
+            path = reference(options["trajectory"], car, *self._speed)
+        return replace(self.base_task, path=path, vehicle=car)
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Drive one control period; see the class for actions, rewards, ends and errors."""
+        if not self._running:
+            raise gymnasium.error.ResetNeeded(
+                "the episode has not begun or has ended: call reset() before step()"
+            )
+        self._take(action)
+        end = kernels.step(
+            self._memory, self._action, self._constants, self._table, self._bound, self._observation
+        )
+        info = self._info()
+        memory = self._memory
+        if end:
+            info["end"] = kernels.END_NAMES[end]
+            self._running = False
+        if self.render_mode == "human":
+            self.render()
+        truncated = end == kernels.TIME_LIMIT
+        return (
+            self._observation.copy(),
+            float(memory[kernels.REWARD]),
+            bool(end) and not truncated,
+            truncated,
+            info,
+        )
+
+    def _take(self, action: Any) -> None:
+        """Check an action and keep it, leaving the episode untouched if it is refused."""
+        try:
+            a, delta = action
+            a, delta = float(a), float(delta)
+        except (TypeError, ValueError):
+            raise ValueError(
+                "action must be two numbers [acceleration m/s^2, steering angle rad], "
+                f"not {action!r}"
+            ) from None
+        if not (math.isfinite(a) and math.isfinite(delta)):
+            entry = "1 (steering angle)" if math.isfinite(a) else "0 (acceleration)"
+            raise ValueError(f"action entry {entry} is not finite: {action!r}")
+        self._action[0] = a
+        self._action[1] = delta
+
+    def _info(self) -> dict[str, Any]:
+        memory = self._memory
+        values = memory.tolist()
+        parts = values[kernels.TERMS : kernels.TERMS + len(TERMS)]
+        return {
+            "lateral_error": values[kernels.LATERAL_ERROR],
+            "heading_error": values[kernels.HEADING_ERROR],
+            "speed_error": values[kernels.SPEED_ERROR],
+            "arc_length": values[kernels.ARC_LENGTH],
+            "state": memory[:6].copy(),
+            "reward_terms": dict(zip(TERMS, parts, strict=True)),
+            "clipped": int(values[kernels.CLIPPED]),
+        }
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Draw the scene: a frame (600, 900, 3) uint8 for "rgb_array", a window for "human"."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() needs render_mode='human' or 'rgb_array'")
+            return None
+        if self._renderer is None:
+            from lpv_track_env.rendering import Renderer
+
+            self._renderer = Renderer(self.render_mode, self.metadata["render_fps"])
+            self._renderer.begin(self.task)
+        return self._renderer.draw(self._memory)
+
+    def show_plan(self, plan: NDArray[np.float64] | None) -> None:
+        """Give the renderer an agent's predicted positions, (n, 2) m, to draw in the next frame."""
+        if self._renderer is not None:
+            self._renderer.plan = plan
+
+    def close(self) -> None:
+        """Close the window, if any."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_renderer": None}
+
+
+def _load_vehicle(value: str | Path | VehicleParameters) -> VehicleParameters:
+    return vehicle.load(value)
+
+
+def _number(options: Mapping[str, Any], key: str, default: float) -> float:
+    value = float(options.get(key, default))
+    if not math.isfinite(value):
+        raise ValueError(f"reset option {key} must be finite, not {value}")
+    return value

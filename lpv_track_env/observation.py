@@ -1,0 +1,140 @@
+"""The observation contract: what every agent, model-based or learned, is given.
+
+A flat float32 vector. Everything is in the vehicle's or the path's own frame, so nothing wraps:
+
+====================  =======  ==========================================================
+entry                 unit     meaning
+====================  =======  ==========================================================
+longitudinal_speed    m/s      vx, body frame
+lateral_speed         m/s      vy, body frame, left positive
+yaw_rate              rad/s    r, counter-clockwise
+acceleration          m/s^2    the acceleration command that the actuator has in force
+steering_angle        rad      the steering angle that the actuator has in force, left positive
+lateral_error         m        offset from the path's foot point, positive left of the path
+heading_error         rad      psi minus the path's heading at the foot point, in (-pi, pi]
+reference_speed       m/s      the reference's speed at the foot point
+preview_curvature     1/m      (K,) mean signed curvature over each of the next K periods
+preview_speed         m/s      (K,) reference speed at the end of each of these periods
+====================  =======  ==========================================================
+
+The preview runs on the reference's own time: node k lies where the reference is k preview periods
+after the foot point. Its interval k is about (speed at k + speed at k + 1) / 2 times the period
+long and turns the heading by exactly that length times `preview_curvature[k]`; so an agent
+rebuilds the reference in the frame of the foot point from the vector alone.
+"""
+
+import hashlib
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+SCALARS = (
+    ("longitudinal_speed", "m/s", 100.0),
+    ("lateral_speed", "m/s", 100.0),
+    ("yaw_rate", "rad/s", 100.0),
+    ("acceleration", "m/s^2", 50.0),
+    ("steering_angle", "rad", 1.6),
+    ("lateral_error", "m", 1000.0),
+    ("heading_error", "rad", 3.1415928),
+    ("reference_speed", "m/s", 100.0),
+)
+"""Name, unit and bound of each scalar entry; values beyond a bound saturate at it."""
+
+PREVIEW_BOUNDS = (("preview_curvature", "1/m", 20.0), ("preview_speed", "m/s", 100.0))
+
+Array = NDArray[np.float64]
+
+
+class TrackingObservation(NamedTuple):
+    """A flat observation taken apart: scalars shaped (...), previews (..., K), float64."""
+
+    longitudinal_speed: Array
+    lateral_speed: Array
+    yaw_rate: Array
+    acceleration: Array
+    steering_angle: Array
+    lateral_error: Array
+    heading_error: Array
+    reference_speed: Array
+    preview_curvature: Array
+    preview_speed: Array
+
+
+@dataclass(frozen=True)
+class ObservationLayout:
+    """Names, units, slices and bounds of the observation vector.
+
+    Parameters
+    ----------
+    preview_steps
+        K, number of preview nodes.
+    preview_period
+        s between preview nodes.
+
+    Raises
+    ------
+    ValueError
+        If there is no preview node or the period is not positive.
+    """
+
+    preview_steps: int = 20
+    preview_period: float = 0.05
+
+    def __post_init__(self) -> None:
+        if self.preview_steps < 1:
+            raise ValueError(f"preview_steps must be at least 1, not {self.preview_steps}")
+        if not 0.0 < self.preview_period <= 10.0:
+            raise ValueError(f"preview_period must be in (0, 10] s, not {self.preview_period}")
+
+    @property
+    def size(self) -> int:
+        """Length of the vector."""
+        return len(SCALARS) + 2 * self.preview_steps
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        """Where each named entry stands in the vector."""
+        scalars = {name: slice(k, k + 1) for k, (name, _, _) in enumerate(SCALARS)}
+        first, k = len(SCALARS), self.preview_steps
+        return {
+            **scalars,
+            "preview_curvature": slice(first, first + k),
+            "preview_speed": slice(first + k, first + 2 * k),
+        }
+
+    @property
+    def bound(self) -> NDArray[np.float32]:
+        """Symmetric bound of each entry, shape (size,)."""
+        scalars = [bound for _, _, bound in SCALARS]
+        previews = [
+            bound for _, _, bound in PREVIEW_BOUNDS for _ in range(self.preview_steps)
+        ]
+        return np.array(scalars + previews, dtype=np.float32)
+
+    @property
+    def digest(self) -> str:
+        """Short hash of names, units and sizes: a policy is made for one layout only."""
+        parts = [*SCALARS, *PREVIEW_BOUNDS, self.preview_steps, float(self.preview_period)]
+        return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+    def unpack(self, observation: ArrayLike) -> TrackingObservation:
+        """Take a vector (size,) or a batch (n, size) apart.
+
+        Raises
+        ------
+        ValueError
+            If the last dimension is not `size`.
+        """
+        values = np.asarray(observation, dtype=np.float64)
+        if values.shape[-1:] != (self.size,):
+            raise ValueError(
+                f"observation has shape {values.shape}, this layout has {self.size} entries "
+                f"({self.preview_steps} preview steps): make the agent for this environment"
+            )
+        first, k = len(SCALARS), self.preview_steps
+        scalars = (values[..., index] for index in range(first))
+        return TrackingObservation(
+            *scalars, values[..., first : first + k], values[..., first + k :]
+        )

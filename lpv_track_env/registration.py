@@ -1,0 +1,16 @@
+"""Gymnasium ids of this package.
+
+Gymnasium 1.0 dropped plugin entry points, so an id is known once `lpv_track_env` is imported, or
+when it names the module itself: `gymnasium.make("lpv_track_env:lpv_track_env/PathTracking-v0")`.
+Nothing heavy is imported here.
+"""
+
+import gymnasium
+
+PATH_TRACKING = "lpv_track_env/PathTracking-v0"
+
+
+def register() -> None:
+    """Register every id, once."""
+    if PATH_TRACKING not in gymnasium.registry:
+        gymnasium.register(id=PATH_TRACKING, entry_point="lpv_track_env.env:PathTrackingEnv")

@@ -1,0 +1,140 @@
+"""What an environment is made for: path, vehicle, periods, limits, as its kernels take them."""
+
+import difflib
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trajectories
+from lpv_track_env import kernels, vehicle
+from lpv_track_env.bicycle import fastest_pole
+from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.reward import RewardWeights
+from lpv_track_env.vehicle import VehicleParameters
+from trajectories import ReferencePath
+from trajectories.speed import constant_speed
+
+SPEED_MODES = ("variable", "fixed")
+CONDITIONS = ("simulation",)
+LONGEST_SUBSTEP = 0.005
+"""s; shortened where the vehicle's fastest pole at standstill asks for it."""
+POLE_STEP = 1.5
+"""Largest product of substep and pole; Runge-Kutta's stability ends at 2.78."""
+
+Array = NDArray[np.float64]
+
+
+def choose(kind: str, value: str, known: tuple[str, ...]) -> str:
+    """Return `value` if known, else raise a ValueError that lists the known ones and the nearest."""
+    if value in known:
+        return value
+    nearest = difflib.get_close_matches(str(value), known, n=1, cutoff=0.0)[0]
+    raise ValueError(f"unknown {kind} {value!r}; known: {', '.join(known)} (nearest: {nearest})")
+
+
+def reference(
+    trajectory: str | Path | ReferencePath,
+    parameters: VehicleParameters,
+    speed_mode: str,
+    fixed_speed: float | None,
+) -> ReferencePath:
+    """The path that is tracked: loaded, with the speed mode applied and lowered to the vehicle's."""
+    path = trajectories.load(trajectory)
+    choose("speed_mode", speed_mode, SPEED_MODES)
+    if speed_mode == "fixed":
+        speed = constant_speed(path) if fixed_speed is None else float(fixed_speed)
+        if not (math.isfinite(speed) and speed > 0):
+            raise ValueError(f"fixed_speed must be positive, not {fixed_speed!r} m/s")
+        path = path.with_speed(speed, speed_mode="fixed")
+    elif fixed_speed is not None:
+        raise ValueError("fixed_speed needs speed_mode='fixed'")
+    fastest = parameters.speed_range[1]
+    if path.speed.max() > fastest:
+        message = f"path {path.name!r}: speed lowered to the vehicle's {fastest:g} m/s"
+        warnings.warn(message, UserWarning, stacklevel=3)
+        noted = [*path.metadata.get("warnings", []), message]
+        path = path.with_speed(np.minimum(path.speed, fastest), warnings=noted)
+    return path
+
+
+@dataclass(frozen=True)
+class Task:
+    """Settings of path tracking, shared by every environment on these kernels.
+
+    Fields are those of `PathTrackingEnv`, resolved.
+    """
+
+    path: ReferencePath
+    vehicle: VehicleParameters
+    control_period: float
+    layout: ObservationLayout
+    reward_weights: RewardWeights
+    max_lateral_error: float
+    time_limit: float | None
+
+    def __post_init__(self) -> None:
+        if not 0.001 <= self.control_period <= 1.0:
+            raise ValueError(f"control_period must be in [0.001, 1] s, not {self.control_period}")
+        if not self.max_lateral_error > 0:
+            raise ValueError(f"max_lateral_error must be positive, not {self.max_lateral_error} m")
+        if self.time_limit is not None and not self.time_limit > 0:
+            raise ValueError(f"time_limit must be positive, not {self.time_limit} s")
+
+    @property
+    def substeps(self) -> int:
+        """Integration steps in a control period."""
+        longest = min(LONGEST_SUBSTEP, POLE_STEP / fastest_pole(0.0, self.vehicle))
+        return math.ceil(self.control_period / longest - 1e-9)
+
+    @property
+    def max_steps(self) -> int:
+        """Control periods until truncation; by default one and a half times the path's duration."""
+        limit = 1.5 * self.path.duration + 10.0 if self.time_limit is None else self.time_limit
+        return math.ceil(limit / self.control_period - 1e-9)
+
+    def constants(self) -> Array:
+        """Numbers as the kernels take them, shape (CONSTANTS_SIZE,)."""
+        car, period = self.vehicle, self.control_period
+        low, high = car.acceleration_range
+        return np.concatenate(
+            [
+                car.as_array(),
+                [
+                    car.max_steering_angle,
+                    car.max_steering_rate * period,
+                    low,
+                    high,
+                    car.max_jerk * period,
+                    period,
+                    self.substeps,
+                    self.layout.preview_period,
+                    self.max_lateral_error,
+                    self.max_steps,
+                    self.path.length,
+                    float(self.path.closed),
+                ],
+                self.reward_weights.as_array(),
+            ]
+        )
+
+    def initial_memory(self, arc_length: float, errors: tuple[float, float, float]) -> Array:
+        """Memory of an episode that begins at an arc length with errors in (e_y, e_psi, vx)."""
+        lateral_error, heading_error, speed_error = errors
+        at = self.path.sample(arc_length)
+        heading = float(at.heading)
+        memory = np.zeros(kernels.MEMORY_SIZE)
+        memory[:6] = (
+            float(at.speed) + speed_error,
+            0.0,
+            heading + heading_error,
+            0.0,
+            float(at.x) - lateral_error * math.sin(heading),
+            float(at.y) + lateral_error * math.cos(heading),
+        )
+        memory[kernels.ACCELERATION] = self.vehicle.rolling_deceleration
+        memory[kernels.ARC_LENGTH] = arc_length
+        return memory
