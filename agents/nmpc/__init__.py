@@ -1,1 +1,1 @@
-"""agents/nmpc."""
+"""The LPV-NMPC: one optimal control problem, several solvers, one agent around them."""

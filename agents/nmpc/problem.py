@@ -1,0 +1,116 @@
+"""The optimal control problem of the LPV-NMPC, as mathematics that every solver implements.
+
+State x = [vx, vy, psi, r, X, Y] and reference in the frame of the path's foot point, input
+u = [a, delta], output y = C x = [vx, psi, X, Y] (kumar2025lpv, section III)::
+
+    min   1/2 e_N' S e_N + 1/2 sum_{i<N} (e_i' Q e_i + u_i' R u_i) + sum penalty(slack)
+    e_i = reference_i - C x_i
+    x_{i+1} = F(x_i, u_i)                        Runge-Kutta steps of x' = A(x, u) x + B(x, u) u
+    |delta_i| <= delta_max,  a_min <= a_i <= a_max
+    |delta_i - delta_{i-1}| <= Ts delta'_max,  |a_i - a_{i-1}| <= Ts a'_max     (u_{-1}: in force now)
+    vx_min <= vx_i <= vx_max        (soft)       i = 1..N
+    |vy_i| <= ratio vx_i            (soft)       i = 1..N
+    vx'_min <= vx'(x_i, u_i) <= vx'_max (soft)   i = 0..N-1
+
+A soft constraint may be broken by its slack s >= 0 at a price of linear s + 1/2 quadratic s^2; the
+price is exact for multipliers below `linear`, so a slack is used only where the path asks for the
+impossible (the limit on vy alone caps curvature, see the errata).
+"""
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lpv_track_env.bicycle import fastest_pole
+from lpv_track_env.vehicle import VehicleParameters
+
+Array = NDArray[np.float64]
+
+STATES, INPUTS, OUTPUTS, SOFT = 6, 2, 4, 3
+RK4_STABILITY = 2.78
+"""Largest product of step and pole for which classic Runge-Kutta is stable (real poles)."""
+
+
+class Status(Enum):
+    """Result of a solve, in acados's vocabulary."""
+
+    SUCCESS = "SUCCESS"
+    MAXITER = "MAXITER"
+    INFEASIBLE = "INFEASIBLE"
+    NAN = "NAN"
+    TIMEOUT = "TIMEOUT"
+    QP_FAILURE = "QP_FAILURE"
+
+
+@dataclass(frozen=True)
+class NmpcProblem:
+    """Dimensions, bounds and penalties of the problem; weights are given with every solve.
+
+    Parameters
+    ----------
+    vehicle
+        The prediction model and its constraints.
+    horizon
+        N, number of control periods predicted.
+    period
+        Ts, s.
+    linear_penalty, quadratic_penalty
+        Prices of slack on (vx m/s, vy m/s, vx' m/s^2), shape (3,).
+
+    Raises
+    ------
+    ValueError
+        For a horizon below 1, a period that is not positive, or a negative penalty.
+    """
+
+    vehicle: VehicleParameters
+    horizon: int = 20
+    period: float = 0.05
+    linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0)
+    quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0)
+
+    def __post_init__(self) -> None:
+        if self.horizon < 1:
+            raise ValueError(f"horizon must be at least 1, not {self.horizon}")
+        if not (math.isfinite(self.period) and self.period > 0):
+            raise ValueError(f"period must be positive, not {self.period} s")
+        if min(*self.linear_penalty, *self.quadratic_penalty) < 0:
+            raise ValueError("penalties must not be negative")
+
+    @property
+    def substeps(self) -> int:
+        """Runge-Kutta steps a period, for stability from the least permitted speed upwards."""
+        slowest = max(self.vehicle.speed_range[0], 1.0)
+        return math.ceil(self.period * fastest_pole(slowest, self.vehicle) / RK4_STABILITY)
+
+    @property
+    def input_bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bound of u, each (2,)."""
+        low, high = self.vehicle.acceleration_range
+        limit = self.vehicle.max_steering_angle
+        return np.array([low, -limit]), np.array([high, limit])
+
+    @property
+    def input_steps(self) -> Array:
+        """Largest change of u in a period, (2,)."""
+        return self.period * np.array([self.vehicle.max_jerk, self.vehicle.max_steering_rate])
+
+
+class Solution(NamedTuple):
+    """One solve: what came out, how, and at what price.
+
+    `inputs` (N, 2) and `states` (N + 1, 6) are the plan, or None where there is none to trust;
+    `slack` (N, 3) by which the soft constraints on vx, vy and vx' are broken in it.
+    """
+
+    status: Status
+    inputs: Array | None
+    states: Array | None
+    slack: Array | None
+    cost: float
+    iterations: int
+    seconds: float

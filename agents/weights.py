@@ -1,0 +1,172 @@
+"""Weights of the NMPC's cost, and schedules that choose them from curvature."""
+
+import dataclasses
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from trajectories import CurvatureBands, ReferencePath
+
+Array = NDArray[np.float64]
+
+LOWEST, HIGHEST = 1e-4, 1e6
+"""Bounds of every weight; `TrackingWeights.clipped` brings others within them."""
+FORMAT = "weight-schedule/1"
+
+
+@dataclass(frozen=True)
+class TrackingWeights:
+    """Diagonals of the cost's matrices: Q (stage) and S (end) on [vx, psi, X, Y], R on [a, delta].
+
+    Only ratios matter to the plan. The defaults track all six trajectories within centimetres:
+    heading is weighted a tenth of position, since a car in a bend drives with sideslip and a
+    heading error of zero would cost lateral error.
+
+    Raises
+    ------
+    ValueError
+        For a wrong number of weights, or one that is negative or not finite.
+    """
+
+    Q: tuple[float, float, float, float] = (1.0, 1.0, 10.0, 10.0)
+    S: tuple[float, float, float, float] = (5.0, 5.0, 50.0, 50.0)
+    R: tuple[float, float] = (0.1, 1.0)
+
+    def __post_init__(self) -> None:
+        for name, size in (("Q", 4), ("S", 4), ("R", 2)):
+            values = tuple(float(value) for value in getattr(self, name))
+            if len(values) != size:
+                raise ValueError(f"{name} needs {size} weights, not {len(values)}")
+            if not all(math.isfinite(value) and value >= 0.0 for value in values):
+                raise ValueError(f"{name} must be finite and not negative, not {values}")
+            object.__setattr__(self, name, values)
+
+    def as_array(self) -> Array:
+        """Q, S, R in one vector, shape (10,)."""
+        return np.array([*self.Q, *self.S, *self.R])
+
+    @classmethod
+    def from_array(cls, values: ArrayLike) -> "TrackingWeights":
+        """Inverse of `as_array`."""
+        flat = np.asarray(values, dtype=np.float64).tolist()
+        if len(flat) != 10:
+            raise ValueError(f"10 weights are needed, not {len(flat)}")
+        return cls(tuple(flat[:4]), tuple(flat[4:8]), tuple(flat[8:]))
+
+    def clipped(self) -> "TrackingWeights":
+        """Every weight brought within [LOWEST, HIGHEST]."""
+        return self.from_array(np.clip(self.as_array(), LOWEST, HIGHEST))
+
+    def blended(self, other: "TrackingWeights", share: float) -> "TrackingWeights":
+        """Geometric mean with another set: this one at share 0, the other at 1."""
+        here, there = (np.log(w.clipped().as_array()) for w in (self, other))
+        return self.from_array(np.exp((1.0 - share) * here + share * there))
+
+
+@dataclass(frozen=True)
+class WeightSchedule:
+    """Q and S (and R) per curvature band.
+
+    Parameters
+    ----------
+    bands
+        The bands of |kappa|.
+    weights
+        One set per band, from the straightest to the sharpest.
+    blend
+        Half width, as a share of a threshold, of the zone around it in which the two sets are
+        blended geometrically; 0 switches hard, with the bands' hysteresis.
+    provenance
+        Where the numbers come from, plain JSON values.
+
+    Raises
+    ------
+    ValueError
+        If the number of sets does not fit the bands, or blending zones would overlap.
+    """
+
+    bands: CurvatureBands
+    weights: tuple[TrackingWeights, ...]
+    blend: float = 0.0
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if len(self.weights) != len(self.bands):
+            raise ValueError(f"{len(self.bands)} bands need as many sets, not {len(self.weights)}")
+        edges = np.array(self.bands.thresholds)
+        if (
+            not 0.0 <= self.blend < 1.0
+            or (edges[1:] * (1.0 - self.blend) < edges[:-1] * (1.0 + self.blend)).any()
+        ):
+            raise ValueError(f"blend {self.blend} must be in [0, 1) and its zones must not overlap")
+
+    def for_path(self, path: ReferencePath) -> TrackingWeights:
+        """The paper's rule: one set, chosen by the path's sharpest curvature."""
+        return self.weights[self.bands.select(path.curvature)]
+
+    def select(
+        self, curvature: Sequence[float] | Array, band: int | None = None
+    ) -> tuple[TrackingWeights, int]:
+        """Weights for a preview of curvature (1/m), and the band to hand in with the next call."""
+        chosen = self.bands.select(curvature, band)
+        if self.blend == 0.0:
+            return self.weights[chosen], chosen
+        sharpest = float(np.max(np.abs(curvature)))
+        for k, edge in enumerate(self.bands.thresholds):
+            low, high = edge * (1.0 - self.blend), edge * (1.0 + self.blend)
+            if low < sharpest < high:
+                share = (sharpest - low) / (high - low)
+                return self.weights[k].blended(self.weights[k + 1], share), chosen
+        return self.weights[int(self.bands.classify(sharpest))], chosen
+
+    def write(self, file: Path) -> None:
+        """Write as JSON, atomically."""
+        content = {
+            "format": FORMAT,
+            "bands": dataclasses.asdict(self.bands),
+            "weights": [dataclasses.asdict(weights) for weights in self.weights],
+            "blend": self.blend,
+            "provenance": dict(self.provenance),
+        }
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(
+            "w", encoding="utf-8", dir=file.parent, suffix=".tmp", delete=False
+        ) as handle:
+            json.dump(content, handle, indent=2)
+            handle.flush()
+            os.fsync(handle.fileno())
+        Path(handle.name).replace(file)
+
+    @classmethod
+    def read(cls, file: Path) -> "WeightSchedule":
+        """Read what `write` wrote.
+
+        Raises
+        ------
+        ValueError
+            One line that names the file, if it cannot be read or is not such a schedule.
+        """
+        try:
+            content = json.loads(Path(file).read_text(encoding="utf-8"))
+            if content.get("format") != FORMAT:
+                raise ValueError(f"format is {content.get('format')!r}, not {FORMAT!r}")
+            bands = {
+                key: tuple(value) if isinstance(value, list) else value
+                for key, value in content["bands"].items()
+            }
+            return cls(
+                CurvatureBands(**bands),
+                tuple(TrackingWeights(**weights) for weights in content["weights"]),
+                float(content["blend"]),
+                content["provenance"],
+            )
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"weight schedule {file}: {error}") from error
