@@ -140,7 +140,7 @@ def from_geometry(
     closed: bool = False,
     **metadata: object,
 ) -> ReferencePath:
-    """A path with the jerk-limited speed profile that some limits allow on a geometry."""
+    """Add the jerk-limited speed profile that some limits allow to a geometry."""
     spacing = float(geometry.arc_length[1])
     speed = plan_speed(geometry.curvature, spacing, limits, closed=closed, share=geometry.share)
     return ReferencePath(
@@ -184,7 +184,7 @@ def _raw(name: str) -> ReferencePath:
     from scipy.optimize import brentq
 
     rows, drivable = PUBLISHED[name].rows, _drivable(name)
-    counts = int(round(rows.length / SPACING))
+    counts = round(rows.length / SPACING)
     spacing = rows.length / counts
     sharpest = brentq(
         lambda d: _kink_curvature(d, spacing)[0] - rows.max_curvature, 1e-3, 0.9 * math.pi
@@ -193,7 +193,7 @@ def _raw(name: str) -> ReferencePath:
     turning = np.flatnonzero(np.abs(drivable.curvature) > 1e-9)
     for run in np.split(turning, np.flatnonzero(np.diff(turning) > 1) + 1):
         angle = float(drivable.heading[run[-1]] - drivable.heading[run[0]])
-        parts = max(int(math.ceil(abs(angle) / (0.98 * sharpest))), 1)
+        parts = max(math.ceil(abs(angle) / (0.98 * sharpest)), 1)
         for part in range(parts):
             turns.append(angle / parts)
             places.append(run[0] + (part + 0.5) / parts * (run[-1] - run[0]))
@@ -216,12 +216,12 @@ def _raw(name: str) -> ReferencePath:
 
 
 def _kinked(x: Array, y: Array, spacing: float, name: str) -> ReferencePath:
-    """A raw path: headings and curvature by central differences, speed that a vehicle can drive."""
+    """Make a raw path: heading and curvature by central differences, a speed that is drivable."""
     rows = PUBLISHED[name].rows
     dx, dy = np.gradient(x), np.gradient(y)
     heading = np.unwrap(np.arctan2(dy, dx))
     # A kink spread over 12 m by a Hann window: what a vehicle's own turning makes of it.
-    window = np.hanning(2 * int(round(6.0 / spacing)) + 1)
+    window = np.hanning(2 * round(6.0 / spacing) + 1)
     turning = np.gradient(heading, spacing)
     effective = np.convolve(turning, window / window.sum(), mode="same")
     limits = limits_of(rows)
@@ -234,8 +234,10 @@ def _kinked(x: Array, y: Array, spacing: float, name: str) -> ReferencePath:
             "source": f"kinked waypoints matching both curvature rows of {name} in kumar2025lpv",
             "generator": GENERATOR, "published": asdict(rows), "limits": asdict(limits),
             "warnings": [
-                "curvature at the kinks is beyond every vehicle's: the speed follows the turning "
-                "averaged over 12 m, not the kinks"
+                (
+                    "curvature at the kinks is beyond every vehicle's: the speed follows the "
+                    "turning averaged over 12 m, not the kinks"
+                )
             ],
         },
     )  # fmt: skip
@@ -260,20 +262,23 @@ def _analytic(name: str) -> ReferencePath:
     return from_geometry(geometry, SHAPE_LIMITS, name, closed=closed, source=f"analytic: {name}")
 
 
-def _circle(t: Array) -> tuple[Array, ...]:
+def _circle(t: Array) -> shapes.Derivatives:
     radius = 30.0
     x, y = radius * np.sin(t), radius * (1.0 - np.cos(t))
     return x, y, radius * np.cos(t), radius * np.sin(t), -radius * np.sin(t), radius * np.cos(t)
 
 
-def _figure_eight(t: Array) -> tuple[Array, ...]:
-    """Gerono's lemniscate, 80 m by 40 m, crossing itself at the origin."""
-    a = 40.0
+def _figure_eight(t: Array) -> shapes.Derivatives:
+    """Gerono's lemniscate, 88 m by 44 m, crossing itself at the origin.
+
+    Its sharpest 0.109 1/m is within the 0.115 1/m that a wheelbase of 5 m can steer.
+    """
+    a = 44.0
     x, y = a * np.sin(t), 0.5 * a * np.sin(2.0 * t)
     return x, y, a * np.cos(t), a * np.cos(2.0 * t), -x, -4.0 * y
 
 
-def _sine(t: Array) -> tuple[Array, ...]:
+def _sine(t: Array) -> shapes.Derivatives:
     """Amplitude 2 m, period 40 m over 160 m."""
     amplitude, k = 2.0, 2.0 * math.pi / 40.0
     sine, cosine = np.sin(k * t), np.cos(k * t)
@@ -283,7 +288,7 @@ def _sine(t: Array) -> tuple[Array, ...]:
     )  # fmt: skip
 
 
-def _double_lane_change(t: Array) -> tuple[Array, ...]:
+def _double_lane_change(t: Array) -> shapes.Derivatives:
     """Centre line of ISO 3888-1's course: 15 m, 30 m across, 25 m, 25 m back, then straight.
 
     The offset of 3.5 m is the lanes' width in the standard; the ramps are quintic (smoothstep of
@@ -301,7 +306,7 @@ def _double_lane_change(t: Array) -> tuple[Array, ...]:
 
 
 def random_path(seed: int | np.random.Generator, *, length: float | None = None) -> ReferencePath:
-    """A drivable random path: turns of 9 to 60 m radius between straights, for training.
+    """Draw a drivable path: turns of 9 to 60 m radius between straights, for training.
 
     The same seed gives the same path. Speed limits are drawn too: 6 to 14 m/s, 1.0 to 2.0 m/s^2
     laterally, 1.3 to 2.0 m/s^2 longitudinally. `length` (m) is drawn from 300 to 600 unless given.

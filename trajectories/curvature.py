@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,16 +60,17 @@ def statistics(path: ReferencePath) -> PathStatistics:
     """Rows of the paper's trajectory table that a path achieves.
 
     Total curvature is the literal sum of |kappa_i| over waypoints 0.25 m apart, as read in the
-    project's errata.
+    project's errata; a closed path's last waypoint, which repeats the first, does not count.
     """
     curvature = np.abs(path.curvature)
+    once = curvature[:-1] if path.closed else curvature
     return PathStatistics(
         max_speed=float(path.speed.max()),
         max_acceleration=float(path.acceleration.max()),
         max_lateral_acceleration=float((path.speed**2 * curvature).max()),
         length=path.length,
         max_curvature=float(curvature.max()),
-        total_curvature=float(curvature.sum()),
+        total_curvature=float(once.sum()),
     )
 
 
@@ -98,7 +100,7 @@ class CurvatureBands:
 
     def __post_init__(self) -> None:
         edges = (0.0, *self.thresholds)
-        if any(b <= a for a, b in zip(edges, edges[1:], strict=False)):
+        if not all(b > a for a, b in pairwise(edges)):
             raise ValueError(f"thresholds must increase from above 0: {self.thresholds}")
         if len(self.names) != len(self.thresholds) + 1:
             raise ValueError(
@@ -129,5 +131,7 @@ class CurvatureBands:
 
     def shares(self, path: ReferencePath) -> Array:
         """Share of a path's length in each band, (len(self),)."""
-        counts = np.bincount(self.classify(path.curvature), minlength=len(self))
-        return counts / counts.sum()
+        once = path.curvature[:-1] if path.closed else path.curvature
+        counts = np.bincount(self.classify(once), minlength=len(self))
+        shares: Array = counts / counts.sum()
+        return shares

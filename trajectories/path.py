@@ -14,6 +14,8 @@ SPACING = 0.25
 """m, the grid of arc length that every path is kept on (up to fitting its length exactly)."""
 MINIMUM_POINTS = 4
 MINIMUM_SPEED = 0.05
+SEAM_GAP = 2e-3
+"""m, and share of a turn: how exactly the ends of a closed path join."""
 
 Array = NDArray[np.float64]
 
@@ -40,10 +42,18 @@ class Projection(NamedTuple):
 
 
 class Preview(NamedTuple):
-    """What the reference does over the next periods of its own time, see `ReferencePath.preview`."""
+    """The reference over the next periods of its own time, see `ReferencePath.preview`."""
 
     curvature: Array
     speed: Array
+
+
+def _finite(what: str, values: ArrayLike) -> Array:
+    """Array of values of any shape, after a check that compiled code can take them."""
+    array = np.asarray(values, dtype=np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{what} must be finite, not {values!r}")
+    return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +75,8 @@ class ReferencePath:
     name
         Name for reports.
     closed
-        Whether the end joins the start (the last node repeats the first, heading up to whole turns).
+        Whether the end joins the start (the last node repeats the first, heading up to whole
+        turns).
     metadata
         Plain JSON values: source, published and achieved rows, limits used, warnings.
 
@@ -73,7 +84,8 @@ class ReferencePath:
     ------
     ValueError
         For fewer than 4 points, unequal lengths, a value that is not finite (with its column and
-        index), arc length that does not start at 0, increase and stay uniform, or speed <= 0.05 m/s.
+        index), arc length that does not start at 0, increase and stay uniform, a closed path whose
+        ends do not join, or speed under 0.05 m/s.
     """
 
     arc_length: Array
@@ -114,11 +126,25 @@ class ReferencePath:
                 f"path {self.name!r}: arc_length must start at 0 and be uniform "
                 f"(index {int(np.argmax(uneven)) + 1} is not)"
             )
+        self._check_seam()
         if (self.speed < MINIMUM_SPEED).any():
             index = int(np.argmin(self.speed))
             raise ValueError(
                 f"path {self.name!r}: speed[{index}] is {self.speed[index]} m/s, "
                 f"at least {MINIMUM_SPEED} is needed"
+            )
+
+    def _check_seam(self) -> None:
+        """Reject a closed path whose ends do not join."""
+        if not self.closed:
+            return
+        gap = float(np.hypot(self.x[-1] - self.x[0], self.y[-1] - self.y[0]))
+        if gap > SEAM_GAP:
+            raise ValueError(f"path {self.name!r}: closed, but its ends are {gap:.3g} m apart")
+        turns = (self.heading[-1] - self.heading[0]) / (2.0 * np.pi)
+        if abs(turns - round(turns)) > SEAM_GAP:
+            raise ValueError(
+                f"path {self.name!r}: closed, but it turns by {turns:.4f} turns, not whole ones"
             )
 
     @property
@@ -168,7 +194,7 @@ class ReferencePath:
 
     def sample(self, s: ArrayLike) -> PathSample:
         """Interpolate at arc lengths s (m, any shape), wrapped if closed, clamped if open."""
-        s = np.asarray(s, dtype=np.float64)
+        s = _finite("arc length", s)
         rows = np.empty((s.size, 7))
         for k, value in enumerate(s.ravel()):
             arguments = (self.table, self.length, self.closed, float(value))
@@ -190,6 +216,7 @@ class ReferencePath:
         stays on the local branch of a path that crosses or approaches itself; without, all of it.
         The lateral error is positive to the left of the path.
         """
+        _finite("position", (x, y) if near is None else (x, y, near))
         start, window = (0.5 * self.length, self.length) if near is None else (near, 3.0)
         if near is None and self.closed:
             window = 0.5 * self.length
@@ -200,7 +227,7 @@ class ReferencePath:
 
     def arc_length_at(self, time: ArrayLike) -> Array:
         """Arc length that the reference has reached at some times (s) after its start, m."""
-        times = np.asarray(time, dtype=np.float64)
+        times = _finite("time", time)
         values = [
             projection.arc_length_at(self.table, self.length, self.closed, float(t), 0)[0]
             for t in times.ravel()
@@ -213,6 +240,7 @@ class ReferencePath:
         `curvature` (count,): mean signed curvature between successive nodes of the reference's own
         time grid, 1/m; `speed` (count,): speed at each interval's end, m/s.
         """
+        _finite("arc length and period", (s, period))
         curvature, speed = np.empty(count), np.empty(count)
         projection.preview(
             self.table, self.length, self.closed, float(s), float(period), curvature, speed

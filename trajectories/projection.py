@@ -28,12 +28,12 @@ Float = Any
 
 @compiled
 def cell(s: Float, length: Float, closed: bool, n: int) -> tuple[int, Float]:
-    """Cell index and offset (m) within it; s is wrapped on a closed path, clamped on an open one."""
+    """Cell index and offset (m) in it; s is wrapped on a closed path, clamped on an open one."""
     spacing = length / (n - 1)
     if closed:
         s -= math.floor(s / length) * length
     s = min(max(s, 0.0), length)
-    index = min(int(s / spacing), n - 2)
+    index = max(min(int(s / spacing), n - 2), 0)  # never outside, even for NaN
     return index, s - index * spacing
 
 
@@ -83,7 +83,7 @@ def position_at(table: Table, length: Float, closed: bool, s: Float) -> tuple[Fl
 
 @compiled
 def speed_at(table: Table, length: Float, closed: bool, s: Float) -> Float:
-    """Reference speed, m/s: its square is linear within a cell."""
+    """Speed of the reference, m/s: its square is linear within a cell."""
     n = table.shape[0]
     index, offset = cell(s, length, closed, n)
     u = offset * (n - 1) / length
@@ -162,8 +162,8 @@ def project(
     """
     n = table.shape[0]
     spacing = length / (n - 1)
-    middle = int(math.floor(near / spacing + 0.5))
-    reach = int(math.ceil(window / spacing))
+    middle = math.floor(near / spacing + 0.5)
+    reach = math.ceil(window / spacing)
     if not closed:
         middle = min(max(middle, 0), n - 1)
     node = nearest_node(table, closed, x, y, middle - reach, 2 * reach + 1)
@@ -198,8 +198,9 @@ def preview(
     """Fill the preview at s: what the reference does over the next `count` periods of its own time.
 
     `curvature[k]`, shape (count,): mean signed curvature between the arc lengths that the reference
-    reaches k and k + 1 periods from now, so that headings at these nodes follow exactly; `speed[k]`,
-    shape (count,): its speed at node k + 1. An open path goes on straight at its last speed.
+    reaches k and k + 1 periods from now, so that headings at these nodes follow exactly;
+    `speed[k]`, shape (count,): its speed at node k + 1. An open path goes on straight at its last
+    speed.
     """
     n = table.shape[0]
     now = time_at(table, length, closed, s)

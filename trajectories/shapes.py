@@ -14,15 +14,17 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from trajectories.path import SPACING
 from trajectories.speed import SpeedLimits
 
 Array = NDArray[np.float64]
+Derivatives: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
+"""x, y, their first and their second derivatives, each (n,)."""
 
 TRANSITION_RATE_SHARE = 1.0
 _SEGMENT = re.compile(
@@ -115,6 +117,8 @@ def fit(
         If the turns alone are longer than the length asked for, or there is nothing to scale.
     """
     turning = sum(abs(segment.turn) for segment in segments)
+    if total_turning is not None and turning == 0.0:
+        raise ValueError("no turns to scale to a total turning")
     scale = 1.0 if total_turning is None else total_turning / turning
     fitted = []
     for segment in segments:
@@ -148,11 +152,22 @@ def fit(
 
 def grid(length: float, spacing: float = SPACING) -> Array:
     """Uniform arc length from 0 to `length`, as near to `spacing` as fits."""
-    return np.linspace(0.0, length, max(int(round(length / spacing)), 3) + 1)
+    return np.linspace(0.0, length, max(round(length / spacing), 3) + 1)
 
 
 def build(segments: Sequence[Segment]) -> Geometry:
-    """Geometry of fitted segments (every turn with its length and transition), from the origin."""
+    """Geometry of fitted segments (every turn with its length and transition), from the origin.
+
+    Raises
+    ------
+    ValueError
+        Naming a segment without a length: a turn that did not go through `fit`.
+    """
+    for position, segment in enumerate(segments, start=1):
+        if segment.length <= 0.0:
+            raise ValueError(f"segment {position} has no length: turns get theirs from fit()")
+    if not segments:
+        raise ValueError("no segments")
     # Pieces of curvature: start, length, curvature at both ends, heading at the start.
     pieces: list[tuple[float, float, float, float, float, float]] = []
     start = heading = 0.0
@@ -199,7 +214,7 @@ def integrate(heading: Callable[[Array], Array], s: Array) -> tuple[Array, Array
 
 
 def parametric(
-    curve: Callable[[Array], tuple[Array, Array, Array, Array, Array, Array]],
+    curve: Callable[[Array], Derivatives],
     end: float,
     *,
     pieces: int = 20_000,
@@ -232,7 +247,7 @@ def parametric(
     return Geometry(s, x, y, heading, curvature, np.ones_like(s))
 
 
-def polyline(kinks: Sequence[float], lengths: Sequence[float]) -> tuple[Array, Array]:
+def polyline(kinks: Sequence[float], lengths: ArrayLike) -> tuple[Array, Array]:
     """Waypoints on straight legs joined by kinks (rad), legs given in whole steps of a grid.
 
     `lengths` has one leg more than `kinks`; each leg must be a multiple of the step it was counted

@@ -80,7 +80,8 @@ def speed_caps(
     steering = np.arctan(limits.wheelbase * curvature)
     slope = np.maximum(np.abs(np.gradient(steering, spacing)), 1e-12)
     caps = np.minimum(lateral, MARGIN * limits.max_steering_rate / slope)
-    return np.minimum(limits.max_speed, np.maximum(caps, limits.min_speed))
+    bounded: Array = np.minimum(limits.max_speed, np.maximum(caps, limits.min_speed))
+    return bounded
 
 
 def plan_speed(
@@ -120,7 +121,9 @@ def plan_speed(
     padded = np.pad(caps, reach, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
     squared = _plan(windows[nodes].min(axis=1) ** 2, length / cells, limits)
-    return np.sqrt(np.minimum(_smooth(squared, fine * (cells / length)), limits.max_speed**2))
+    smoothed = _smooth(squared, fine * (cells / length))
+    planned: Array = np.sqrt(np.minimum(smoothed, limits.max_speed**2))
+    return planned
 
 
 def _smooth(values: Array, at: Array) -> Array:
@@ -133,7 +136,10 @@ def _smooth(values: Array, at: Array) -> Array:
     node = np.rint(at).astype(int).clip(0, len(values) - 1)
     u = at - node
     before, here, after = padded[node], padded[node + 1], padded[node + 2]
-    return 0.5 * (0.5 - u) ** 2 * before + (0.75 - u * u) * here + 0.5 * (0.5 + u) ** 2 * after
+    smoothed: Array = (
+        0.5 * (0.5 - u) ** 2 * before + (0.75 - u * u) * here + 0.5 * (0.5 + u) ** 2 * after
+    )
+    return smoothed
 
 
 def _plan(caps: Array, h: float, limits: SpeedLimits) -> Array:

@@ -1,0 +1,105 @@
+"""Published against achieved rows of trajectories, and a figure of their paths."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from trajectories import PUBLISHED, ReferencePath, load, statistics
+
+ROWS = (
+    ("max_speed", "max speed", "m/s", ".2f"),
+    ("max_acceleration", "max acceleration", "m/s²", ".2f"),
+    ("max_lateral_acceleration", "max lateral acceleration", "m/s²", ".2f"),
+    ("length", "length", "m", ".1f"),
+    ("max_curvature", "max curvature", "1/m", ".3f"),
+    ("total_curvature", "total curvature", "1/m", ".2f"),
+)
+"""Rows of the paper's table: field of `PathStatistics`, words, unit, format."""
+WHY_CURVATURE_DIFFERS = (
+    "Max curvature differs on purpose: the published 1.8 to 4.0 1/m is 15 to 35 times what the "
+    "vehicle steers (0.115 1/m at a 5 m wheelbase). It is what the paper's curvature formula gives "
+    "at a kink between dense waypoints, sin(D/2) / (d cos²(D/2)); the Tn-raw paths have such kinks "
+    "and match both curvature rows, at the price of a lateral acceleration no vehicle has there."
+)
+COLOURS = "viridis"
+
+
+def rows_table(names: Sequence[str] = tuple(PUBLISHED)) -> Table:
+    """Table of each trajectory's published and achieved rows, names like "T1" or "T1-raw"."""
+    table = Table(title="Trajectories: published → achieved", caption=WHY_CURVATURE_DIFFERS)
+    table.add_column("row")
+    for name in names:
+        table.add_column(name, justify="right", no_wrap=True)
+    columns = [
+        (PUBLISHED[name.removesuffix("-raw")].rows, statistics(load(name))) for name in names
+    ]
+    for field, words, unit, form in ROWS:
+        cells = [
+            f"{getattr(published, field):{form}} → {getattr(achieved, field):{form}}"
+            for published, achieved in columns
+        ]
+        table.add_row(f"{words}, {unit}", *cells)
+    table.add_row("duration, s", *(f"{load(name).duration:.1f}" for name in names))
+    return table
+
+
+def draw(names: Sequence[str], file: str | Path) -> None:
+    """Draw paths coloured by speed, and curvature and speed over arc length.
+
+    The file's suffix chooses the format (.png, .svg, .pdf).
+    """
+    paths = [load(name) for name in names]
+    colours = Normalize(0.0, max(float(path.speed.max()) for path in paths))
+    figure = Figure(figsize=(12.0, 2.6 * len(paths)), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2 * len(paths), 2, width_ratios=(1.0, 1.5))
+    plans = []
+    for k, path in enumerate(paths):
+        plan = figure.add_subplot(grid[2 * k : 2 * k + 2, 0])
+        _draw_plan(plan, path, colours)
+        plans.append(plan)
+        curvature = figure.add_subplot(grid[2 * k, 1])
+        speed = figure.add_subplot(grid[2 * k + 1, 1], sharex=curvature)
+        curvature.plot(path.arc_length, path.curvature, color="tab:red", linewidth=1.0)
+        curvature.set_ylabel("κ (1/m)")
+        curvature.tick_params(labelbottom=False)
+        speed.plot(path.arc_length, path.speed, color="tab:blue", linewidth=1.0)
+        speed.set_ylabel("v (m/s)")
+        speed.set_ylim(bottom=0.0)
+        for axes in (curvature, speed):
+            axes.set_xlim(0.0, path.length)
+            axes.grid(alpha=0.3)
+    speed.set_xlabel("arc length s (m)")
+    figure.colorbar(
+        plans[0].collections[0], ax=plans, location="left", shrink=0.5, label="speed (m/s)"
+    )
+    figure.savefig(Path(file), dpi=110)
+
+
+def _draw_plan(axes: Axes, path: ReferencePath, colours: Normalize) -> None:
+    """One path from above, its start marked."""
+    stride = 4  # 1 m; shorter pieces blur into each other where their ends are antialiased
+    points, speed = np.column_stack([path.x, path.y])[::stride], path.speed[::stride]
+    lines = LineCollection(
+        [*np.stack([points[:-1], points[1:]], axis=1)],
+        cmap=COLOURS, norm=colours, linewidth=2.5, capstyle="projecting",
+    )  # fmt: skip
+    lines.set_array(0.5 * (speed[:-1] + speed[1:]))
+    axes.add_collection(lines)
+    axes.plot(path.x[0], path.y[0], "o", color="black", markersize=6)
+    axes.annotate(
+        "start", (path.x[0], path.y[0]), xytext=(5, 5), textcoords="offset points", fontsize=8
+    )
+    axes.set_title(f"{path.name}: {path.length:.0f} m, {path.duration:.0f} s", fontsize=10)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.autoscale_view()
+    axes.set_xlabel("x (m)")
+    axes.set_ylabel("y (m)")
+    axes.grid(alpha=0.3)

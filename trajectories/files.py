@@ -1,0 +1,253 @@
+"""Path files: the native CSV, and one `read` for everything that `trajectories` can read.
+
+The native format "refpath/1": leading `# key: JSON` lines (format, name, closed, points, frame, and
+the path's metadata with the rows it achieves), one header line, then a row for every node. Numbers
+are written so that reading them gives the same bits.
+"""
+
+import json
+import os
+import re
+import secrets
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trajectories.curvature import circle_curvature, signed_waypoint_curvature, statistics
+from trajectories.importers import (
+    COLUMNS,
+    Table,
+    read_gps,
+    read_racetrack,
+    read_table,
+    read_text,
+    read_xy,
+)
+from trajectories.path import ReferencePath
+from trajectories.speed import SpeedLimits, plan_speed
+
+__all__ = ["read", "read_gps", "read_native", "read_racetrack", "read_xy", "write"]
+
+Array = NDArray[np.float64]
+
+FORMAT = "refpath/1"
+HEADER = ("s_m", "x_m", "y_m", "psi_rad", "kappa_1pm", "v_mps", "ax_mps2", "t_s")
+FRAME = "local: x, y in m, heading counter-clockwise from x"
+RESERVED = ("format", "name", "closed", "points")
+_COMMENT = re.compile(r"#\s*(?P<key>[A-Za-z_][\w-]*)\s*:\s*(?P<value>.*)")
+
+
+def write(path: ReferencePath, file: str | Path) -> None:
+    """Write a path as native CSV, replacing `file` at once or not at all.
+
+    Raises
+    ------
+    ValueError
+        If the metadata holds what JSON does not, with its key.
+    OSError
+        If the file cannot be written.
+    """
+    header = {
+        "format": FORMAT, "name": path.name, "closed": path.closed,
+        "points": len(path.arc_length), "frame": FRAME,
+        **{key: value for key, value in path.metadata.items() if key not in RESERVED},
+        "achieved": asdict(statistics(path)),
+    }  # fmt: skip
+    lines = [_comment(key, value) for key, value in header.items()]
+    lines.append(",".join(HEADER))
+    columns = (
+        path.arc_length, path.x, path.y, path.heading, path.curvature, path.speed,
+        path.acceleration, path.time,
+    )  # fmt: skip
+    lines.extend(",".join(map(repr, row)) for row in np.column_stack(columns).tolist())
+    _replace(Path(file), "\n".join(lines) + "\n")
+
+
+def _comment(key: str, value: object) -> str:
+    try:
+        line = f"# {key}: {json.dumps(value, allow_nan=False, default=_plain)}"
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"metadata[{key!r}] cannot be written as JSON: {error}") from error
+    if _COMMENT.fullmatch(line) is None:
+        raise ValueError(f"metadata key {key!r} must be a word")
+    return line
+
+
+def _plain(value: object) -> object:
+    """NumPy values as JSON's."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is not a JSON value")
+
+
+def _replace(file: Path, text: str) -> None:
+    """Write text to a temporary file beside `file`, flush it to the disk, and rename it."""
+    temporary = file.with_name(f".{file.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with temporary.open("w", encoding="utf-8", newline="\n") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(file)
+    except OSError as error:
+        raise OSError(error.errno, f"cannot write the path: {error.strerror}", str(file)) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read(file: str | Path) -> ReferencePath:
+    """Read a path, whatever its format: native, racetrack-database, GPS log, or plain x,y.
+
+    The content decides, by its header; the importers have options, which `read` leaves at their
+    defaults.
+
+    Raises
+    ------
+    ValueError
+        In one line that names the file and the line or column at fault.
+    """
+    lines = [line for line in read_text(file).split("\n", 50)[:50] if line.startswith("#")]
+    for line in lines:
+        match = _COMMENT.match(line.strip())
+        if match is not None and match["key"] == "format":
+            return read_native(file)
+    table = read_table(file)
+    if set(COLUMNS["width"]) <= set(table.header):
+        return read_racetrack(file)
+    if table.find("latitude") is not None and table.find("longitude") is not None:
+        return read_gps(file)
+    return read_xy(file)
+
+
+def read_native(
+    file: str | Path, *, limits: SpeedLimits | None = None, name: str | None = None
+) -> ReferencePath:
+    """Read a native CSV; the arrays are those that `write` was given, to the bit.
+
+    Parameters
+    ----------
+    file
+        CSV file in format "refpath/1".
+    limits
+        Plan the speed anew within these; the stored profile is kept if None.
+    name
+        Name instead of the stored one.
+
+    Raises
+    ------
+    ValueError
+        For a torn file, an unknown format version, a number that is none, arc length that does
+        not increase, or heading and curvature that disagree with the positions.
+    """
+    metadata, table = _split(Path(file))
+    columns = dict(zip(HEADER, (table.column(k) for k in range(len(HEADER))), strict=True))
+    label, closed = metadata.pop("name", Path(file).stem), metadata.pop("closed", False)
+    if not isinstance(label, str) or not isinstance(closed, bool):
+        table.fail("name must be a JSON string and closed true or false")
+    s, x, y, psi, kappa, v = (columns[key] for key in HEADER[:6])
+    try:
+        path = ReferencePath(s, x, y, psi, kappa, v, label if name is None else name, closed,
+                             metadata)  # fmt: skip
+    except ValueError as error:
+        table.fail(str(error))
+    _check_geometry(path, table)
+    _check_motion(path, columns, table)
+    if limits is not None:
+        try:
+            speed = plan_speed(path.curvature, path.spacing, limits, closed=closed)
+        except RuntimeError as error:
+            table.fail(str(error))
+        path = path.with_speed(speed, limits=asdict(limits))
+    return path
+
+
+def _split(file: Path) -> tuple[dict[str, Any], Table]:
+    """Metadata and table of a native file that is whole."""
+    table = Table(file, HEADER, [], [])
+    lines = read_text(file).split("\n")
+    metadata = _metadata(lines, table)
+    first = len(metadata)
+    version = metadata.pop("format", None)
+    if version != FORMAT:
+        table.fail(f"format {version!r} is not known, only {FORMAT!r}")
+    if first >= len(lines) or lines[first].strip() != ",".join(HEADER):
+        table.fail(f"line {first + 1} is not the header {','.join(HEADER)}")
+    if lines[-1].strip():
+        table.fail(f"torn: line {len(lines)} has no end")
+    for number, line in enumerate(lines[first + 1 : -1], start=first + 2):
+        cells = line.strip().split(",")
+        if len(cells) != len(HEADER):
+            table.fail(f"line {number} has {len(cells)} columns, not {len(HEADER)}")
+        table.rows.append(cells)
+        table.lines.append(number)
+    points = metadata.pop("points", len(table.rows))
+    if points != len(table.rows):
+        table.fail(f"torn: {len(table.rows)} of {points} points are there")
+    return metadata, table
+
+
+def _metadata(lines: list[str], table: Table) -> dict[str, Any]:
+    """Values of the leading `# key: JSON` lines, every key once."""
+    metadata: dict[str, Any] = {}
+    for number, line in enumerate(lines, start=1):
+        if not line.startswith("#"):
+            break
+        match = _COMMENT.fullmatch(line.strip())
+        if match is None or match["key"] in metadata:
+            table.fail(f"line {number} is not '# key: JSON' with a new key")
+        try:
+            metadata[match["key"]] = json.loads(match["value"], parse_constant=_no_constant)
+        except (ValueError, RecursionError):
+            table.fail(f"line {number}: {match['key']} is not JSON")
+    return metadata
+
+
+def _no_constant(text: str) -> NoReturn:
+    raise ValueError(f"{text} is not JSON")
+
+
+def _check_geometry(path: ReferencePath, table: Table) -> None:
+    """Reject arc length, heading or curvature that the positions contradict.
+
+    Heading is compared with central differences, curvature with the circle through three points
+    and with the waypoint formula of raw paths; the better of both counts. The bounds let
+    coordinates rounded to 1 mm pass, and the differences' own error on a grid of 0.25 m.
+    """
+    h = path.spacing
+    steps = np.hypot(np.diff(path.x), np.diff(path.y))
+    _reject(np.abs(steps - h) > 0.02 * h + 2e-3, 1, "s_m disagrees with x, y", table)
+    direction = np.arctan2(np.gradient(path.y), np.gradient(path.x))
+    apart = np.angle(np.exp(1j * (path.heading - direction)))
+    allowed = np.full_like(apart, 0.02)
+    allowed[[0, -1]] += h * np.abs(path.curvature[[0, -1]])
+    _reject(np.abs(apart) > allowed, 0, "psi_rad disagrees with the direction of x, y", table)
+    jumps = np.abs(np.diff(path.heading)) > np.pi
+    _reject(jumps, 1, "psi_rad jumps by more than half a turn: it must be unwrapped", table)
+    circle, waypoint = circle_curvature(path.x, path.y), signed_waypoint_curvature(path.x, path.y)
+    apart = np.minimum(np.abs(path.curvature - circle), np.abs(path.curvature - waypoint))
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(np.abs(circle), 2, mode="edge"), 5)
+    wrong = apart > 0.01 + 0.1 * around.max(axis=1)
+    wrong[[0, 1, -2, -1]] = False  # one-sided differences
+    _reject(wrong, 0, "kappa_1pm disagrees with the curvature of x, y", table)
+
+
+def _reject(wrong: NDArray[np.bool_], offset: int, message: str, table: Table) -> None:
+    if wrong.any():
+        index = int(np.flatnonzero(wrong)[0]) + offset
+        table.fail(f"{message} at index {index} (line {table.lines[index]})")
+
+
+def _check_motion(path: ReferencePath, columns: dict[str, Array], table: Table) -> None:
+    """Warn of acceleration or time that do not follow from the speeds, which are what counts."""
+    for key, values, tolerance in (
+        ("ax_mps2", path.acceleration, 1e-3),
+        ("t_s", path.time, 1e-3 + 1e-4 * path.duration),
+    ):
+        if np.abs(columns[key] - values).max() > tolerance:
+            warnings.warn(
+                f"{table.file}: {key} does not follow from v_mps, which is used", stacklevel=4
+            )

@@ -1,0 +1,489 @@
+"""Import foreign paths: racing circuits, plain x,y lists, GPS logs.
+
+All go one way: checks, a smoothing spline whose deviation is reported, resampling at 0.25 m of arc
+length, heading and curvature from the spline's derivatives, a jerk-limited speed profile.
+"""
+
+import math
+import warnings
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from trajectories.catalog import from_geometry
+from trajectories.path import MINIMUM_POINTS, SPACING, ReferencePath
+from trajectories.shapes import Geometry
+from trajectories.smoothing import smooth
+from trajectories.speed import SpeedLimits
+
+Array = NDArray[np.float64]
+
+IMPORT_LIMITS = SpeedLimits(max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5)
+"""Speed limits of an imported path unless given: those of the analytic shapes, from 1.5 m/s."""
+SMOOTHING = 0.05
+"""m rms: takes the jitter out of 5 m points (largest curvature 0.162 to 0.104 1/m on one track)."""
+GPS_SMOOTHING = 0.2
+"""m rms."""
+MAX_STEERING_ANGLE = math.pi / 6
+"""rad, of every vehicle of the project (kumar2025lpv, constraint table)."""
+
+DUPLICATE = 1e-3
+GAP_FACTOR = 10.0
+APPROACH, APPROACH_ALONG = 2.5, 20.0
+MINIMUM_LENGTH, MAXIMUM_LENGTH = 1.0, 30_000.0
+LARGEST_COORDINATE = 1e7
+"""All in m but the factor; a coordinate beyond the last is not on Earth's map."""
+
+EQUATOR, FLATTENING = 6_378_137.0, 1.0 / 298.257223563
+"""WGS-84 ellipsoid: semi-major axis, m, and flattening."""
+
+COLUMNS = {
+    "x": ("x", "x_m", "east", "east_m", "easting", "easting_m"),
+    "y": ("y", "y_m", "north", "north_m", "northing", "northing_m"),
+    "latitude": ("lat", "latitude", "lat_deg", "latitude_deg"),
+    "longitude": ("lon", "lng", "long", "longitude", "lon_deg", "longitude_deg"),
+    "height": ("h", "h_m", "height", "height_m", "alt", "alt_m", "altitude", "altitude_m", "ele"),
+    "time": ("t", "t_s", "time", "time_s", "timestamp"),
+    "width": ("w_tr_right_m", "w_tr_left_m"),
+}
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells of a separated text file: header (lower case, may be empty), rows and their lines."""
+
+    file: Path
+    header: tuple[str, ...]
+    rows: list[list[str]]
+    lines: list[int]
+
+    def fail(self, message: str) -> NoReturn:
+        """Raise a ValueError that names the file."""
+        raise ValueError(f"{self.file}: {message}")
+
+    def find(self, quantity: str) -> int | None:
+        """Index of a quantity's column by its known names."""
+        for name in COLUMNS[quantity]:
+            if name in self.header:
+                return self.header.index(name)
+        return None
+
+    def column(self, index: int) -> Array:
+        """One column's numbers, (n,), finite."""
+        name = self.header[index] if self.header else str(index + 1)
+        values = np.empty(len(self.rows))
+        for k, (row, line) in enumerate(zip(self.rows, self.lines, strict=True)):
+            try:
+                values[k] = float(row[index])
+            except ValueError:
+                self.fail(f"line {line}, column {name}: {row[index][:40]!r} is not a number")
+            if not math.isfinite(values[k]):
+                self.fail(f"line {line}, column {name}: {row[index][:40]!r} is not finite")
+        return values
+
+
+def read_text(file: str | Path) -> str:
+    """Text of a file; every failure to read it is a ValueError of one line."""
+    try:
+        return Path(file).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise ValueError(f"{file}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{file}: is not a text file (byte {error.start})") from error
+
+
+def read_table(file: str | Path) -> Table:
+    """Split a text file at `,` or `;`; a header may be a `#` comment or a line without numbers.
+
+    Raises
+    ------
+    ValueError
+        For a file that cannot be read, has no rows, or a row of another number of cells.
+    """
+    comments: list[tuple[str, ...]] = []
+    header: tuple[str, ...] = ()
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    for number, line in enumerate(read_text(file).split("\n"), start=1):
+        text = line.strip()
+        cells = [cell.strip() for cell in text.lstrip("#").split(";" if ";" in text else ",")]
+        if not text:
+            continue
+        if text.startswith("#"):
+            if not rows:
+                comments.append(tuple(cell.strip('" ').lower() for cell in cells))
+        elif not rows and not header and not any(map(_is_number, cells)):
+            header = tuple(cell.strip('" ').lower() for cell in cells)
+        else:
+            rows.append(cells)
+            lines.append(number)
+    table = Table(Path(file), header, rows, lines)
+    if not rows:
+        table.fail("has no rows of numbers")
+    width = len(header or rows[0])
+    for row, number in zip(rows, lines, strict=True):
+        if len(row) != width:
+            table.fail(f"line {number} has {len(row)} columns, not {width}: torn or not a table")
+    if not header:
+        known = {name for group in COLUMNS.values() for name in group}
+        fitting = [c for c in comments if len(c) == width and len(known.intersection(c)) >= 2]
+        table = Table(table.file, fitting[-1] if fitting else (), rows, lines)
+    return table
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def read_racetrack(
+    file: str | Path,
+    *,
+    closed: bool | None = True,
+    scale: float = 1.0,
+    limits: SpeedLimits = IMPORT_LIMITS,
+    smoothing: float = SMOOTHING,
+    name: str | None = None,
+) -> ReferencePath:
+    """Import a centre line of the racetrack-database, `# x_m,y_m,w_tr_right_m,w_tr_left_m`.
+
+    Parameters
+    ----------
+    file
+        CSV file; the widths are not used.
+    closed
+        Circuits are; None looks at whether the ends meet.
+    scale
+        Factor on all coordinates, to fit a circuit to a vehicle.
+    limits
+        Speed limits; the default is 10 m/s, 2 m/s^2 laterally, 1.5 m/s^2 longitudinally.
+    smoothing
+        Largest rms deviation of the path from the (scaled) points, m; 0 interpolates.
+    name
+        The file's stem unless given.
+
+    Raises
+    ------
+    ValueError
+        For a file that cannot be read or is no drivable path, naming line and column.
+    """
+    table = read_table(file)
+    if len(table.rows[0]) != 4 or (table.header and table.find("width") is None):
+        table.fail("is no racetrack-database file: x_m,y_m,w_tr_right_m,w_tr_left_m expected")
+    points = np.column_stack([table.column(0), table.column(1)])
+    importer = _Importer(table, "racetrack-database centre line", limits, smoothing)
+    return importer.path(importer.scaled(points, scale), name, closed)
+
+
+def read_xy(
+    file: str | Path,
+    *,
+    closed: bool | None = None,
+    scale: float = 1.0,
+    limits: SpeedLimits = IMPORT_LIMITS,
+    smoothing: float = SMOOTHING,
+    name: str | None = None,
+) -> ReferencePath:
+    """Import waypoints x,y in metres; further columns need a header that names x and y.
+
+    Parameters are those of `read_racetrack`; `closed` None takes the path as closed if its ends
+    are within 1.5 times the spacing (median, first or last) and the direction goes on from one to
+    the other.
+
+    Raises
+    ------
+    ValueError
+        For a file that cannot be read, is no drivable path, or looks like degrees.
+    """
+    table = read_table(file)
+    x, y = table.find("x"), table.find("y")
+    if table.header and (x is None or y is None):
+        if table.find("latitude") is not None:
+            table.fail("has latitudes and longitudes, not metres: read it with read_gps")
+        table.fail(
+            f"no columns x and y in its header {','.join(table.header)[:80]!r}; "
+            f"known: {', '.join(COLUMNS['x'])}"
+        )
+    if not table.header and len(table.rows[0]) != 2:
+        table.fail(f"{len(table.rows[0])} columns without a header: name them, e.g. x_m,y_m")
+    points = np.column_stack([table.column(x or 0), table.column(1 if y is None else y)])
+    small = np.ptp(points, axis=0).max() < 0.5 and np.abs(points).max() <= 180.0
+    if small and scale == 1.0 and len(points) >= MINIMUM_POINTS:
+        table.fail(
+            "all points lie within 0.5 m and look like degrees: name the columns lat,lon to have "
+            "them read as a GPS log, or give a scale if they are lengths"
+        )
+    importer = _Importer(table, "x,y waypoints", limits, smoothing)
+    return importer.path(importer.scaled(points, scale), name, closed)
+
+
+def read_gps(
+    file: str | Path,
+    *,
+    closed: bool | None = None,
+    origin: tuple[float, float, float] | None = None,
+    minimum_distance: float = SPACING,
+    limits: SpeedLimits = IMPORT_LIMITS,
+    smoothing: float = GPS_SMOOTHING,
+    name: str | None = None,
+) -> ReferencePath:
+    """Import a GPS log: columns lat, lon, optionally height and time (seconds or ISO 8601).
+
+    Parameters
+    ----------
+    file
+        CSV file with a header.
+    closed
+        As in `read_xy`.
+    origin
+        Latitude and longitude (deg) and height (m) of x = y = 0; the first point unless given.
+        x points east and y north there. It is kept in `metadata["origin"]`.
+    minimum_distance
+        m: points nearer than this to the last one kept are dropped (standstill), counted in
+        `metadata["dropped"]`.
+    limits, smoothing, name
+        As in `read_racetrack`; consumer receivers may need more `smoothing`.
+
+    Raises
+    ------
+    ValueError
+        For a file that cannot be read, angles out of range, time that goes back, or no drivable
+        path.
+    """
+    table = read_table(file)
+    columns = {key: table.find(key) for key in ("latitude", "longitude", "height", "time")}
+    if columns["latitude"] is None or columns["longitude"] is None:
+        table.fail("is no GPS log: a header with lat and lon is needed")
+    angles = {}
+    for key, bound in (("latitude", 90.0), ("longitude", 180.0)):
+        angles[key] = table.column(columns[key] or 0)
+        beyond = np.flatnonzero(np.abs(angles[key]) > bound)
+        if beyond.size:
+            value = angles[key][beyond[0]]
+            table.fail(
+                f"line {table.lines[beyond[0]]}: {key} {value:g} is beyond {bound:g} degrees; "
+                "coordinates in metres need columns x_m,y_m"
+            )
+    zero = np.zeros(len(table.rows))
+    height = zero if columns["height"] is None else table.column(columns["height"])
+    if columns["time"] is not None:
+        back = np.flatnonzero(np.diff(_times(table, columns["time"])) < 0)
+        if back.size:
+            table.fail(f"line {table.lines[back[0] + 1]}: time goes back")
+    if origin is None:
+        origin = (float(angles["latitude"][0]), float(angles["longitude"][0]), float(height[0]))
+    points = east_north_up(angles["latitude"], angles["longitude"], height, origin)[:, :2]
+    importer = _Importer(table, "GPS log", limits, smoothing)
+    kept = importer.thinned(points, minimum_distance)
+    importer.metadata["origin"] = dict(
+        zip(("latitude_deg", "longitude_deg", "height_m"), origin, strict=True)
+    )
+    importer.metadata["frame"] = "east-north-up at origin (WGS-84): x east, y north, m"
+    importer.metadata["dropped"] = len(points) - len(kept)
+    return importer.path(kept, name, closed)
+
+
+def _times(table: Table, index: int) -> Array:
+    """Seconds (n,) from a column of numbers or ISO 8601 stamps."""
+    if _is_number(table.rows[0][index]):
+        return table.column(index)
+    stamps = np.empty(len(table.rows))
+    for k, row in enumerate(table.rows):
+        try:
+            stamps[k] = datetime.fromisoformat(row[index].strip('"')).timestamp()
+        except (ValueError, OverflowError, OSError):
+            table.fail(f"line {table.lines[k]}: {row[index][:40]!r} is not a time")
+    return stamps
+
+
+def earth_centred(latitude: Array, longitude: Array, height: Array) -> Array:
+    """Earth-centred coordinates (n, 3), m, of WGS-84 latitude, longitude (deg) and height (m)."""
+    phi, lam = np.radians(latitude), np.radians(longitude)
+    square = FLATTENING * (2.0 - FLATTENING)  # e^2
+    normal = EQUATOR / np.sqrt(1.0 - square * np.sin(phi) ** 2)  # N(phi)
+    return np.column_stack(
+        [
+            (normal + height) * np.cos(phi) * np.cos(lam),
+            (normal + height) * np.cos(phi) * np.sin(lam),
+            ((1.0 - square) * normal + height) * np.sin(phi),
+        ]
+    )
+
+
+def east_north_up(
+    latitude: Array, longitude: Array, height: Array, origin: tuple[float, float, float]
+) -> Array:
+    """Coordinates (n, 3), m, in the plane that touches the ellipsoid at an origin (deg, deg, m)."""
+    offset = earth_centred(latitude, longitude, height)
+    offset = offset - earth_centred(*(np.array([value]) for value in origin))
+    phi, lam = math.radians(origin[0]), math.radians(origin[1])
+    sp, cp, sl, cl = math.sin(phi), math.cos(phi), math.sin(lam), math.cos(lam)
+    axes = np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
+    turned: Array = offset @ axes.T
+    return turned
+
+
+@dataclass
+class _Importer:
+    """From points to a path, for one file: checks, spline, speed, and what there is to warn of."""
+
+    table: Table
+    kind: str
+    limits: SpeedLimits
+    smoothing: float
+    metadata: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    def warn(self, message: str) -> None:
+        """Warn of something that is accepted, and keep it for the path's metadata."""
+        self.warnings.append(message)
+        warnings.warn(f"{self.table.file}: {message}", stacklevel=5)
+
+    def scaled(self, points: Array, scale: float) -> Array:
+        """Scale points (n, 2), and keep the factor."""
+        if not (math.isfinite(scale) and scale > 0.0):
+            raise ValueError(f"scale must be positive, not {scale}")
+        if scale != 1.0:
+            self.metadata["scale"] = scale
+        return points * scale
+
+    def thinned(self, points: Array, distance: float) -> Array:
+        """Points (m, 2) at least `distance` from the one kept before them, and their lines."""
+        kept = [0]
+        for k in range(1, len(points)):
+            if math.dist(points[k], points[kept[-1]]) >= distance:
+                kept.append(k)
+        self.table.lines[:] = [self.table.lines[k] for k in kept]
+        return points[kept]
+
+    def path(self, points: Array, name: str | None, closed: bool | None) -> ReferencePath:
+        """Check points (n, 2), smooth and resample them, and plan a speed profile."""
+        if not (math.isfinite(self.smoothing) and self.smoothing >= 0.0):
+            raise ValueError(f"smoothing must be 0 or more, not {self.smoothing}")
+        points = self._checked(points)
+        points, closed = self._ends(points, closed)
+        self._check_steps(points, closed)
+        smoothed = smooth(points, self.smoothing, closed=closed)
+        geometry = smoothed.geometry
+        self._check_curve(geometry, closed)
+        try:
+            return from_geometry(
+                geometry, self.limits, self.table.file.stem if name is None else name,
+                closed=closed,
+                source=f"{self.kind}: {self.table.file.name}",
+                smoothing=self.smoothing,
+                max_deviation=smoothed.max_deviation,
+                rms_deviation=smoothed.rms_deviation,
+                warnings=self.warnings,
+                **self.metadata,
+            )  # fmt: skip
+        except RuntimeError as error:  # the linear programme found no profile
+            raise ValueError(f"{self.table.file}: {error}") from error
+
+    def _checked(self, points: Array) -> Array:
+        """Points (m, 2) without duplicates, enough of them and none too far away."""
+        far = np.flatnonzero(np.abs(points).max(axis=1) > LARGEST_COORDINATE)
+        if far.size:
+            self.table.fail(f"line {self.table.lines[far[0]]}: coordinate beyond 1e7 m")
+        before, lines = len(points), list(self.table.lines)
+        points = self.thinned(points, DUPLICATE)
+        if len(points) < before:
+            first = next(line for line in lines if line not in set(self.table.lines))
+            self.warn(f"{before - len(points)} duplicates under 1 mm merged (first: line {first})")
+        if len(points) < MINIMUM_POINTS:
+            self.table.fail(f"{len(points)} distinct points, at least {MINIMUM_POINTS} are needed")
+        return points
+
+    def _ends(self, points: Array, closed: bool | None) -> tuple[Array, bool]:
+        """Points without a repeated start, and whether the path is closed."""
+        gap = points[0] - points[-1]
+        repeated = bool(np.hypot(*gap) < DUPLICATE)
+        if closed is None:
+            steps = np.diff(points, axis=0)
+            distances = np.hypot(*steps.T)
+            usual = max(float(np.median(distances)), distances[0], distances[-1])
+            near = np.hypot(*gap) <= 1.5 * usual
+            across = steps[0] if repeated else gap
+            closed = bool(near and across @ steps[-1] > 0.0 and across @ steps[0] > 0.0)
+        if closed and repeated:
+            points = points[:-1]
+            if len(points) < MINIMUM_POINTS:
+                self.table.fail(f"{len(points)} distinct points, {MINIMUM_POINTS} are needed")
+        return points, closed
+
+    def _check_steps(self, points: Array, closed: bool) -> None:
+        """Reject reversals and lengths that are no path's; warn of gaps."""
+        steps = np.diff(np.vstack([points, points[:1]]) if closed else points, axis=0)
+        distances = np.hypot(*steps.T)
+        length = float(distances.sum())
+        if not MINIMUM_LENGTH <= length <= MAXIMUM_LENGTH:
+            self.table.fail(
+                f"{length:.4g} m long, not between {MINIMUM_LENGTH:g} and {MAXIMUM_LENGTH:g} m: "
+                "are these metres?"
+            )
+        following = np.roll(steps, -1, axis=0) if closed else steps[1:]
+        inner = steps[: len(following)]
+        along = (inner * following).sum(axis=1)
+        across = inner[:, 0] * following[:, 1] - inner[:, 1] * following[:, 0]
+        turns = np.degrees(np.abs(np.arctan2(across, along)))
+        back = np.flatnonzero(turns > 90.0)
+        if back.size:
+            index = int(back[0] + 1) % len(points)
+            self.table.fail(
+                f"the path turns back by {turns[back[0]]:.0f} degrees at point {index} "
+                f"(line {self.table.lines[index]})"
+            )
+        widest = int(np.argmax(distances))
+        median = float(np.median(distances))
+        if distances[widest] > GAP_FACTOR * median:
+            self.warn(
+                f"gap of {distances[widest]:.1f} m after line {self.table.lines[widest]}, "
+                f"the median is {median:.2f} m"
+            )
+
+    def _check_curve(self, geometry: Geometry, closed: bool) -> None:
+        """Warn of bends beyond the steering, and of branches that come near each other."""
+        curvature = np.abs(geometry.curvature)
+        sharpest = int(np.argmax(curvature))
+        steerable = math.tan(MAX_STEERING_ANGLE) / self.limits.wheelbase
+        if curvature[sharpest] > steerable:
+            self.warn(
+                f"curvature {curvature[sharpest]:.3f} 1/m at {geometry.arc_length[sharpest]:.1f} m"
+                f" is beyond the {steerable:.3f} 1/m that a wheelbase of "
+                f"{self.limits.wheelbase:g} m can steer: accepted, speed lowered; more smoothing "
+                "may help"
+            )
+        near = self_approach(geometry, closed)
+        if near is not None:
+            self.warn(
+                f"the path comes within {near[2]:.2f} m of itself, at {near[0]:.1f} m and "
+                f"{near[1]:.1f} m: project with the last arc length at hand"
+            )
+
+
+def self_approach(geometry: Geometry, closed: bool) -> tuple[float, float, float] | None:
+    """Arc lengths and distance (m) where a path is nearest to itself, if under 2.5 m.
+
+    Only points more than 20 m apart along the path count; a closed path's seam joins its ends.
+    """
+    stride = 2  # 0.5 m: nearest nodes are at most 0.35 m further apart than the branches
+    s = geometry.arc_length[::stride]
+    points = np.column_stack([geometry.x[::stride], geometry.y[::stride]])
+    pairs = cKDTree(points).query_pairs(APPROACH, output_type="ndarray")
+    along = np.abs(s[pairs[:, 1]] - s[pairs[:, 0]])
+    if closed:
+        along = np.minimum(along, geometry.arc_length[-1] - along)
+    pairs = pairs[along > APPROACH_ALONG]
+    if not len(pairs):
+        return None
+    distances = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
+    first, second = sorted(pairs[int(np.argmin(distances))])
+    return float(s[first]), float(s[second]), float(distances.min())
