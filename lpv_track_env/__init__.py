@@ -9,7 +9,17 @@ from types import ModuleType
 
 from lpv_track_env.registration import register
 
-_SUBMODULES = ("bicycle", "env", "kernels", "lpv", "observation", "rendering", "reward", "task", "vehicle")
+_SUBMODULES = (
+    "bicycle",
+    "env",
+    "kernels",
+    "lpv",
+    "observation",
+    "rendering",
+    "reward",
+    "task",
+    "vehicle",
+)
 
 register()
 

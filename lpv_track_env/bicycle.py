@@ -16,14 +16,13 @@ Model (kumar2025lpv, section II; state x = [vx, vy, psi, r, X, Y], input u = [a,
     Fyr  = Car (-(vy - lr r)/vx)
 
 From 1 m/s upwards (the paper's domain) the field is exactly this. Below, 1/vx is continued by a
-polynomial that keeps the field twice continuously differentiable, finite at standstill and sound in
-reverse, where tyres damp lateral motion as they do forwards: with q(vx) = `inverse_speed` and the
-signed direction s = vx q (exactly 1 from 1 m/s upwards), slip angles are delta s - (vy + lf r) q and
--(vy - lr r) q, and rolling resistance is mu g s.
+polynomial that keeps the field twice continuously differentiable, finite at standstill and sound
+in reverse, where tyres damp lateral motion as they do forwards: with q(vx) = `inverse_speed` and
+the signed direction s = vx q (exactly 1 from 1 m/s upwards), slip angles are
+delta s - (vy + lf r) q and -(vy - lr r) q, and rolling resistance is mu g s.
 """
 
 from typing import Any
-
 
 import numpy as np
 from numpy.typing import NDArray

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 from lpv_track_env import kernels, vehicle
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import TERMS, RewardWeights
-from lpv_track_env.task import CONDITIONS, Task, choose, reference
+from lpv_track_env.task import CONDITIONS, Task, checked_period, choose, reference
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
+
+if TYPE_CHECKING:
+    from lpv_track_env.rendering import Renderer
 
 RESET_OPTIONS = (
     "trajectory",
@@ -26,6 +29,7 @@ RESET_OPTIONS = (
     "heading_error",
     "speed_error",
 )
+NUMBERS = (float, int)
 
 
 class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -111,7 +115,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     v0: first version.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    # `render_fps` is one frame a control period: an instance has its own.
+    metadata: dict[str, Any] = {  # noqa: RUF012  declared so by gymnasium.Env
         "render_modes": ["human", "rgb_array"],
         "render_fps": 20,
     }
@@ -140,20 +145,26 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.render_mode = render_mode
         self._speed = (speed_mode, fixed_speed)
         self._initial_error_range = tuple(float(value) for value in initial_error_range)
-        if len(self._initial_error_range) != 3 or min(self._initial_error_range) < 0:
+        if len(self._initial_error_range) != 3 or not all(
+            0.0 <= half < math.inf for half in self._initial_error_range
+        ):
             raise ValueError("initial_error_range must be three numbers >= 0: m, rad, m/s")
         self._random_start = random_start
         car = _load_vehicle(vehicle)
-        period = control_period if preview_period is None else preview_period
+        period = checked_period(control_period)
         self.base_task = Task(
             path=reference(trajectory, car, speed_mode, fixed_speed),
             vehicle=car,
-            control_period=float(control_period),
-            layout=ObservationLayout(preview_steps, float(period)),
+            control_period=period,
+            layout=ObservationLayout(
+                preview_steps, period if preview_period is None else float(preview_period)
+            ),
             reward_weights=reward_weights or RewardWeights(),
             max_lateral_error=float(max_lateral_error),
             time_limit=time_limit,
         )
+        fps = max(round(1.0 / self.base_task.control_period), 1)
+        self.metadata = {**self.metadata, "render_fps": fps}
         self._bound = self.base_task.layout.bound
         self.observation_space = spaces.Box(-self._bound, self._bound, dtype=np.float32)
         low, high = car.acceleration_range
@@ -165,7 +176,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._memory = np.zeros(kernels.MEMORY_SIZE)
         self._action = np.zeros(2)
         self._running = False
-        self._renderer: Any = None
+        self._renderer: Renderer | None = None
         self._use(self.base_task)
 
     def _use(self, task: Task) -> None:
@@ -206,10 +217,10 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         options = dict(options or {})
         for key in options:
             choose("reset option", key, RESET_OPTIONS)
-        self._use(self._episode_task(options))
-        length = self.task.path.length
+        task = self._episode_task(options)
+        length = task.path.length
         if self._random_start:
-            share = 1.0 if self.task.path.closed else 0.8
+            share = 1.0 if task.path.closed else 0.8
             arc_length = float(self.np_random.uniform(0.0, share * length))
         else:
             arc_length = 0.0
@@ -222,13 +233,13 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise ValueError(f"option arc_length must be in [0, {length:.2f}] m, not {arc_length}")
         for k, key in enumerate(("lateral_error", "heading_error", "speed_error")):
             errors[k] = _number(options, key, errors[k])
-        self._memory[:] = self.task.initial_memory(arc_length, (errors[0], errors[1], errors[2]))
-        kernels.start(
-            self._memory, self._constants, self._table, self._bound, self._observation
-        )
+        # All is checked: from here on the last episode is gone.
+        self._use(task)
+        self._memory[:] = task.initial_memory(arc_length, (errors[0], errors[1], errors[2]))
+        kernels.start(self._memory, self._constants, self._table, self._bound, self._observation)
         self._running = True
         if self._renderer is not None:
-            self._renderer.begin(self.task)
+            self._renderer.begin(task)
         if self.render_mode == "human":
             self.render()
         return self._observation.copy(), self._info()
@@ -273,9 +284,13 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _take(self, action: Any) -> None:
         """Check an action and keep it, leaving the episode untouched if it is refused."""
         try:
-            a, delta = action
+            # Through plain Python values: a number is then told from text, bool or complex.
+            values = np.asarray(action).tolist()
+            a, delta = values
+            if not (type(values) is list and type(a) in NUMBERS and type(delta) in NUMBERS):
+                raise TypeError
             a, delta = float(a), float(delta)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(
                 "action must be two numbers [acceleration m/s^2, steering angle rad], "
                 f"not {action!r}"
@@ -300,22 +315,25 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             "clipped": int(values[kernels.CLIPPED]),
         }
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene: a frame (600, 900, 3) uint8 for "rgb_array", a window for "human"."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() needs render_mode='human' or 'rgb_array'")
             return None
+        return self._open_renderer(self.render_mode).draw(self._memory)
+
+    def _open_renderer(self, render_mode: str) -> "Renderer":
         if self._renderer is None:
             from lpv_track_env.rendering import Renderer
 
-            self._renderer = Renderer(self.render_mode, self.metadata["render_fps"])
+            self._renderer = Renderer(render_mode, self.metadata["render_fps"])
             self._renderer.begin(self.task)
-        return self._renderer.draw(self._memory)
+        return self._renderer
 
     def show_plan(self, plan: NDArray[np.float64] | None) -> None:
         """Give the renderer an agent's predicted positions, (n, 2) m, to draw in the next frame."""
-        if self._renderer is not None:
-            self._renderer.plan = plan
+        if self.render_mode is not None:
+            self._open_renderer(self.render_mode).plan = plan
 
     def close(self) -> None:
         """Close the window, if any."""
@@ -332,7 +350,11 @@ def _load_vehicle(value: str | Path | VehicleParameters) -> VehicleParameters:
 
 
 def _number(options: Mapping[str, Any], key: str, default: float) -> float:
-    value = float(options.get(key, default))
+    given = options.get(key, default)
+    try:
+        value = float(given)
+    except (TypeError, ValueError):
+        value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"reset option {key} must be finite, not {value}")
+        raise ValueError(f"reset option {key} must be a finite number, not {given!r}")
     return value

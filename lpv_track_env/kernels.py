@@ -1,17 +1,25 @@
-"""Compiled kernels of the path tracking task: actuators, integration, projection, reward, observation.
+"""Compiled kernels of path tracking: actuators, integration, projection, reward, observation.
 
-The scalar functions `actuate`, `integrate`, `observe` and `judge` are what every environment shares;
-`step` and `start` are the single environment's packed entry points. Numba's call overhead is per
-argument, so they take few arrays: `Memory` and `Constants` below name their entries.
+The scalar functions `actuate`, `integrate`, `observe` and `judge` are what every environment
+shares; `step` and `start` are the single environment's packed entry points. Numba's call overhead
+is per argument, so they take few arrays: the indices below name their entries.
 """
 
 import math
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, compiled_field, compiled_inverse_speed
+from lpv_track_env.bicycle import (
+    PSI,
+    VX,
+    VY,
+    YAW_RATE,
+    X,
+    Y,
+    compiled_field,
+    compiled_inverse_speed,
+)
 from lpv_track_env.observation import SCALARS
 from lpv_track_env.reward import terms
 from trajectories.compilation import compiled
@@ -148,7 +156,9 @@ def saturate(value: Any, bound: Any) -> Any:
 
 
 @compiled
-def observe(memory: Array, constants: Array, table: Array, bound: Array, observation: Array) -> None:
+def observe(
+    memory: Array, constants: Array, table: Array, bound: Array, observation: Array
+) -> None:
     """Write the observation (see `observation`) of an episode's memory."""
     k = (observation.shape[0] - PREVIEW_START) // 2
     observation[0] = saturate(memory[VX], bound[0])
@@ -158,7 +168,7 @@ def observe(memory: Array, constants: Array, table: Array, bound: Array, observa
     observation[4] = saturate(memory[STEERING], bound[4])
     observation[5] = saturate(memory[LATERAL_ERROR], bound[5])
     observation[6] = saturate(memory[HEADING_ERROR], bound[6])
-    observation[7] = memory[REFERENCE_SPEED]
+    observation[7] = saturate(memory[REFERENCE_SPEED], bound[7])
     preview(
         table,
         constants[LENGTH],
@@ -168,6 +178,8 @@ def observe(memory: Array, constants: Array, table: Array, bound: Array, observa
         observation[PREVIEW_START : PREVIEW_START + k],
         observation[PREVIEW_START + k :],
     )
+    for j in range(PREVIEW_START, observation.shape[0]):
+        observation[j] = saturate(observation[j], bound[j])
 
 
 @compiled
@@ -232,7 +244,7 @@ def step(
         memory[VX], memory[VY], memory[PSI] = vx, vy, psi
         memory[YAW_RATE], memory[X], memory[Y] = r, x, y
         memory[ACCELERATION], memory[STEERING] = a, delta
-        reach = max(SEARCH_WINDOW, 1.5 * abs(vx) * p[PERIOD])
+        reach = min(max(SEARCH_WINDOW, 1.5 * abs(vx) * p[PERIOD]), p[LENGTH])
         locate(memory, constants, table, before, reach)
     end = judge(memory, constants, finite)
     failed = end in (LEFT_CORRIDOR, WRONG_HEADING, NON_FINITE)

@@ -49,7 +49,7 @@ def entries(
     car: Any,
     rolling_deceleration: Any,
 ) -> tuple[Entries, Entries]:
-    """Non-zero entries of A and B as (row, column) -> value, in plain arithmetic for any backend."""
+    """Non-zero entries of A and B as (row, column) -> value, plain arithmetic for any backend."""
     direction = vx * q
     front, rear = caf * cos_delta, car
     moment = front * lf - rear * lr
@@ -114,7 +114,7 @@ def matrices(
 
 
 def casadi_matrices(state: Any, action: Any, parameters: VehicleParameters) -> tuple[Any, Any]:
-    """A (6, 6) and B (6, 2) as CasADi expressions of the symbols state (6, 1) and action (2, 1)."""
+    """Return A (6, 6) and B (6, 2) as CasADi expressions of state (6, 1) and action (2, 1)."""
     import casadi as ca
 
     vx, vy, psi = state[VX], state[VY], state[PSI]

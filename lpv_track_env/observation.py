@@ -108,9 +108,7 @@ class ObservationLayout:
     def bound(self) -> NDArray[np.float32]:
         """Symmetric bound of each entry, shape (size,)."""
         scalars = [bound for _, _, bound in SCALARS]
-        previews = [
-            bound for _, _, bound in PREVIEW_BOUNDS for _ in range(self.preview_steps)
-        ]
+        previews = [bound for _, _, bound in PREVIEW_BOUNDS for _ in range(self.preview_steps)]
         return np.array(scalars + previews, dtype=np.float32)
 
     @property
@@ -134,7 +132,6 @@ class ObservationLayout:
                 f"({self.preview_steps} preview steps): make the agent for this environment"
             )
         first, k = len(SCALARS), self.preview_steps
-        scalars = (values[..., index] for index in range(first))
-        return TrackingObservation(
-            *scalars, values[..., first : first + k], values[..., first + k :]
-        )
+        scalars = [values[..., index] for index in range(first)]
+        previews = [values[..., first : first + k], values[..., first + k :]]
+        return TrackingObservation._make(scalars + previews)

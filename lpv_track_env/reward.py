@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-
 from trajectories.compilation import compiled
 
 TERMS = ("progress", "lateral", "heading", "speed", "input_rate", "end")

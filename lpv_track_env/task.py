@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trajectories
-from lpv_track_env import kernels, vehicle
+from lpv_track_env import kernels
 from lpv_track_env.bicycle import fastest_pole
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import RewardWeights
@@ -29,11 +29,19 @@ Array = NDArray[np.float64]
 
 
 def choose(kind: str, value: str, known: tuple[str, ...]) -> str:
-    """Return `value` if known, else raise a ValueError that lists the known ones and the nearest."""
+    """Return `value` if known, else raise a ValueError listing the known ones and the nearest."""
     if value in known:
         return value
     nearest = difflib.get_close_matches(str(value), known, n=1, cutoff=0.0)[0]
     raise ValueError(f"unknown {kind} {value!r}; known: {', '.join(known)} (nearest: {nearest})")
+
+
+def checked_period(value: float) -> float:
+    """Return a control period (s) as a float, or raise a ValueError if it makes no sense."""
+    period = float(value)
+    if not 0.001 <= period <= 1.0:
+        raise ValueError(f"control_period must be in [0.001, 1] s, not {value}")
+    return period
 
 
 def reference(
@@ -42,7 +50,7 @@ def reference(
     speed_mode: str,
     fixed_speed: float | None,
 ) -> ReferencePath:
-    """The path that is tracked: loaded, with the speed mode applied and lowered to the vehicle's."""
+    """Load the path that is tracked, its speed by the mode and lowered to the vehicle's range."""
     path = trajectories.load(trajectory)
     choose("speed_mode", speed_mode, SPEED_MODES)
     if speed_mode == "fixed":
@@ -77,12 +85,11 @@ class Task:
     time_limit: float | None
 
     def __post_init__(self) -> None:
-        if not 0.001 <= self.control_period <= 1.0:
-            raise ValueError(f"control_period must be in [0.001, 1] s, not {self.control_period}")
+        checked_period(self.control_period)
         if not self.max_lateral_error > 0:
             raise ValueError(f"max_lateral_error must be positive, not {self.max_lateral_error} m")
-        if self.time_limit is not None and not self.time_limit > 0:
-            raise ValueError(f"time_limit must be positive, not {self.time_limit} s")
+        if self.time_limit is not None and not 0 < self.time_limit < math.inf:
+            raise ValueError(f"time_limit must be positive and finite, not {self.time_limit} s")
 
     @property
     def substeps(self) -> int:

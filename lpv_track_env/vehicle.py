@@ -5,6 +5,7 @@ import difflib
 import json
 import math
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,10 @@ PARAMETER_ORDER = (
     "rolling_deceleration",
 )
 """Order of `VehicleParameters.as_array`, and of the last arguments of `bicycle.field`."""
+
+
+def _finite(value: object) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,7 @@ class VehicleParameters:
     speed_range
         Bounds of vx that a controller keeps, m/s.
     max_lateral_velocity_ratio
-        |vy| <= ratio vx. For a steady turn it is a limit on curvature, about ratio / lr at low speed.
+        |vy| <= ratio vx; in a steady turn at low speed a limit on curvature of about ratio / lr.
     length, width
         Body, m, for drawing only.
 
@@ -90,20 +95,22 @@ class VehicleParameters:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
+            if field.name in {"name", "source"}:
+                continue
             if field.name.endswith("_range"):
-                ends = tuple(float(end) for end in value)
-                if len(ends) != 2 or not all(map(math.isfinite, ends)) or ends[0] >= ends[1]:
+                ends = tuple(value) if isinstance(value, tuple | list) else ()
+                if len(ends) != 2 or not all(map(_finite, ends)) or ends[0] >= ends[1]:
                     raise ValueError(
                         f"vehicle {self.name!r}: {field.name} must be two finite numbers, "
                         f"the lower first, not {value!r}"
                     )
-                object.__setattr__(self, field.name, ends)
+                object.__setattr__(self, field.name, (float(ends[0]), float(ends[1])))
             elif field.name == "rolling_resistance":
-                if not (math.isfinite(value) and value >= 0):
+                if not (_finite(value) and value >= 0):
                     raise ValueError(
                         f"vehicle {self.name!r}: {field.name} must be >= 0, not {value!r}"
                     )
-            elif field.name not in {"name", "source"} and not (math.isfinite(value) and value > 0):
+            elif not (_finite(value) and value > 0):
                 raise ValueError(
                     f"vehicle {self.name!r}: {field.name} must be positive, not {value!r}"
                 )
@@ -212,7 +219,7 @@ def _read(path: Path) -> VehicleParameters:
     except ValueError as error:
         raise ValueError(f"vehicle file {path} is not JSON: {error}") from error
     if not isinstance(values, dict):
-        raise ValueError(f"vehicle file {path} must hold one JSON object")
+        raise ValueError(f"vehicle file {path} must hold one JSON object")  # noqa: TRY004
     values = {"name": path.stem, "source": str(path.name), **values}
     known = {field.name for field in dataclasses.fields(VehicleParameters)}
     if unknown := sorted(set(values) - known):
@@ -221,5 +228,5 @@ def _read(path: Path) -> VehicleParameters:
         )
     try:
         return VehicleParameters(**values)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"vehicle file {path}: {error}") from error

@@ -103,6 +103,7 @@ class IpoptNmpc(TrackingAgent[NmpcMemory]):
             vehicle=model or task.vehicle,
             horizon=horizon,
             period=task.layout.preview_period,
+            first_period=task.control_period,
             linear_penalty=linear_penalty,
             quadratic_penalty=quadratic_penalty,
         )

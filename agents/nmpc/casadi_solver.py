@@ -28,10 +28,16 @@ IPOPT_STATUS = {
     "Restoration_Failed": Status.INFEASIBLE,
     "Invalid_Number_Detected": Status.NAN,
 }
-IPOPT_OPTIONS: dict[str, Any] = {
+COLD_OPTIONS: dict[str, Any] = {
     "print_level": 0,
     "sb": "yes",
     "bound_relax_factor": 0.0,  # the default moves the optimum
+    "mumps_scaling": 0,
+    "mumps_permuting_scaling": 0,
+    "max_iter": 100,
+}
+WARM_OPTIONS: dict[str, Any] = {
+    **COLD_OPTIONS,
     "warm_start_init_point": "yes",
     "warm_start_bound_push": 1e-6,
     "warm_start_bound_frac": 1e-6,
@@ -40,9 +46,6 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "warm_start_mult_bound_push": 1e-6,
     "mu_init": 1e-3,
     "mu_strategy": "adaptive",  # 5 iterations a solve where the monotone strategy takes 13
-    "mumps_scaling": 0,
-    "mumps_permuting_scaling": 0,
-    "max_iter": 100,
 }
 
 
@@ -94,7 +97,8 @@ class CasadiSolver:
         low_dv, high_dv = problem.vehicle.longitudinal_acceleration_range
         ratio = problem.vehicle.max_lateral_velocity_ratio
         linear, quadratic = ca.DM(problem.linear_penalty), ca.DM(problem.quadratic_penalty)
-        step, model = problem.input_steps, discrete_model(problem)
+        steps, model = problem.input_steps, discrete_model(problem)
+        self._model = model
         infinity = np.inf
 
         def constrain(expression: Any, low: Any, high: Any) -> None:
@@ -112,7 +116,7 @@ class CasadiSolver:
             cost += 0.5 * (ca.dot(q, error**2) + ca.dot(r, u**2))
             cost += ca.dot(linear, slack) + 0.5 * ca.dot(quadratic, slack**2)
             constrain(model(state, u) - following, 0.0, 0.0)
-            constrain(u - previous, -step, step)
+            constrain(u - previous, -steps[i], steps[i])
             rate = lpv_field(state, u, problem)[0]
             constrain(rate + slack[2], low_dv, infinity)
             constrain(rate - slack[2], -infinity, high_dv)
@@ -140,15 +144,32 @@ class CasadiSolver:
             "g": ca.vertcat(*constraints),
             "p": parameters,
         }
-        options = {**IPOPT_OPTIONS, "tol": tolerance, "max_wall_time": max_seconds}
-        self._solver = ca.nlpsol(
-            "nmpc",
-            "ipopt",
-            nlp,
-            {"ipopt": options, "expand": True, "print_time": False, "error_on_fail": False},
+        self._cold_solver = self._build(nlp, {**COLD_OPTIONS, "tol": tolerance}, max_seconds)
+        # The same derivative functions, built once, serve the warm-started solver.
+        shared = {
+            option: self._cold_solver.get_function(name)
+            for option, name in (
+                ("grad_f", "nlp_grad_f"),
+                ("jac_g", "nlp_jac_g"),
+                ("hess_lag", "nlp_hess_l"),
+            )
+        }
+        self._warm_solver = self._build(
+            nlp, {**WARM_OPTIONS, "tol": tolerance}, max_seconds, **shared
         )
-        self._warm: dict[str, Any] | None = None
-        self._rows = len(lower) // n
+
+    @staticmethod
+    def _build(
+        nlp: dict[str, Any], ipopt: dict[str, Any], max_seconds: float, **functions: ca.Function
+    ) -> ca.Function:
+        options = {
+            "ipopt": {**ipopt, "max_wall_time": max_seconds},
+            "expand": True,
+            "print_time": False,
+            "error_on_fail": False,
+            **functions,
+        }
+        return ca.nlpsol("nmpc", "ipopt", nlp, options)
 
     def solve(
         self,
@@ -168,10 +189,11 @@ class CasadiSolver:
         parameters = np.concatenate([state, last_input, reference.ravel(), weights])
         if not np.isfinite(parameters).all():
             return Solution(Status.NAN, None, None, None, np.nan, 0, 0.0), None
+        solver = self._cold_solver if warm is None else self._warm_solver
         guess = self._cold(state, last_input) if warm is None else self._shifted(warm)
         try:
-            result = self._solver(p=parameters, **self._bounds, **guess)
-            statistics = self._solver.stats()
+            result = solver(p=parameters, **self._bounds, **guess)
+            statistics = solver.stats()
         except RuntimeError:
             seconds = time.perf_counter() - began
             return Solution(Status.QP_FAILURE, None, None, None, np.nan, 0, seconds), None
@@ -197,10 +219,15 @@ class CasadiSolver:
         return plan, WarmStart(values, *duals)
 
     def _cold(self, state: Array, last_input: Array) -> dict[str, Array]:
-        """Guess without a plan: the state and the input in force, held."""
+        """Guess without a plan: where the model goes with the input in force, held."""
         low, high = self.problem.input_bounds
-        stage = np.concatenate([last_input.clip(low, high), np.zeros(SOFT), state])
-        return {"x0": np.tile(stage, self.problem.horizon)}
+        held, none = last_input.clip(low, high), np.zeros(SOFT)
+        stages = []
+        for _ in range(self.problem.horizon):
+            state = np.asarray(self._model(state, held)).ravel()
+            stages.append(np.concatenate([held, none, state]))
+        guess = np.concatenate(stages)
+        return {"x0": guess if np.isfinite(guess).all() else np.zeros_like(guess)}
 
     def _shifted(self, warm: "WarmStart") -> dict[str, Array]:
         n = self.problem.horizon

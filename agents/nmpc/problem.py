@@ -58,6 +58,8 @@ class NmpcProblem:
         N, number of control periods predicted.
     period
         Ts, s.
+    first_period
+        s until the next plan, over which the first input's change is bounded; Ts unless given.
     linear_penalty, quadratic_penalty
         Prices of slack on (vx m/s, vy m/s, vx' m/s^2), shape (3,).
 
@@ -70,6 +72,7 @@ class NmpcProblem:
     vehicle: VehicleParameters
     horizon: int = 20
     period: float = 0.05
+    first_period: float | None = None
     linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0)
     quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0)
 
@@ -96,8 +99,10 @@ class NmpcProblem:
 
     @property
     def input_steps(self) -> Array:
-        """Largest change of u in a period, (2,)."""
-        return self.period * np.array([self.vehicle.max_jerk, self.vehicle.max_steering_rate])
+        """Largest change of u at the start of each period, (N, 2)."""
+        periods = np.full(self.horizon, self.period)
+        periods[0] = self.period if self.first_period is None else self.first_period
+        return np.outer(periods, [self.vehicle.max_jerk, self.vehicle.max_steering_rate])
 
 
 class Solution(NamedTuple):
