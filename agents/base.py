@@ -94,6 +94,14 @@ class TrackingAgent(ABC, Generic[Memory]):
     def new_memory(self) -> Memory:
         """Memory of a vehicle at the start of an episode."""
 
+    def diagnostics(self, memory: Memory) -> dict[str, Any]:  # noqa: ARG002  for subclasses
+        """What the agent can tell of its last step for one vehicle; empty if nothing.
+
+        Known entries: status, seconds, iterations, cost, slack (3,), fallback, plan (n, 2) in the
+        frame of the path's foot point.
+        """
+        return {}
+
     def reset(self) -> None:
         """Forget everything: the next call begins new episodes."""
         self._memories = []

@@ -1,0 +1,156 @@
+"""The reference rebuilt from the observation's preview, and the turns that follow it."""
+
+import math
+
+import numpy as np
+import pytest
+
+import trajectories
+from agents.reference import (
+    early_turn,
+    lagged_sideslip,
+    local_reference,
+    mean_curvature,
+    point_at,
+    steady_turn,
+    transient_turn,
+)
+from lpv_track_env import bicycle
+from lpv_track_env.observation import ObservationLayout, TrackingObservation
+from lpv_track_env.vehicle import VEHICLES
+
+PERIOD = 0.05
+LAYOUT = ObservationLayout(preview_steps=20, preview_period=PERIOD)
+
+
+def observed(reference_speed, curvature, speed, layout=LAYOUT) -> TrackingObservation:
+    """An observation on the path, previews (K,) or scalars."""
+    row = np.zeros(layout.size)
+    slices = layout.slices
+    row[slices["reference_speed"]] = reference_speed
+    row[slices["preview_curvature"]] = curvature
+    row[slices["preview_speed"]] = speed
+    return layout.unpack(row)
+
+
+@pytest.mark.parametrize(("period", "tolerance"), [(0.02, 1e-4), (0.05, 1e-3), (0.1, 5e-3)])
+def test_nodes_lie_on_the_path(period, tolerance):
+    path = trajectories.load("T1")
+    steps = np.arange(21)
+    for s in np.linspace(0.0, path.length - 30.0, 60):
+        at, preview = path.sample(s), path.preview(s, period, 20)
+        found = local_reference(
+            observed(at.speed, *preview, layout=ObservationLayout(20, period)), period
+        )
+        places = path.arc_length_at(at.time + period * steps)
+        truth = path.sample(places)
+        c, d = np.cos(at.heading), np.sin(at.heading)
+        dx, dy = truth.x - at.x, truth.y - at.y
+        np.testing.assert_allclose(found.x, dx * c + dy * d, atol=tolerance)
+        np.testing.assert_allclose(found.y, dy * c - dx * d, atol=tolerance)
+        np.testing.assert_allclose(found.heading, truth.heading - at.heading, atol=tolerance)
+        np.testing.assert_allclose(found.arc_length, places - s, atol=tolerance)
+        np.testing.assert_allclose(found.speed, truth.speed, atol=1e-9)
+
+
+@pytest.mark.parametrize("radius", [8.0, -8.0, 0.5, 1e9])
+def test_circle_is_exact(radius):
+    found = local_reference(observed(5.0, 1.0 / radius, 5.0), PERIOD)
+    s = 5.0 * PERIOD * np.arange(21)
+    np.testing.assert_allclose(found.arc_length, s, rtol=1e-12)
+    np.testing.assert_allclose(found.heading, s / radius, rtol=1e-12)
+    np.testing.assert_allclose(found.x, radius * np.sin(s / radius), atol=1e-9)
+    np.testing.assert_allclose(found.y, 2.0 * radius * np.sin(0.5 * s / radius) ** 2, atol=1e-9)
+
+
+def test_straight_with_constant_acceleration():
+    speed = 4.0 + 2.0 * PERIOD * np.arange(21)
+    found = local_reference(observed(speed[0], 0.0, speed[1:]), PERIOD)
+    time = PERIOD * np.arange(21)
+    np.testing.assert_allclose(found.x, 4.0 * time + time**2, rtol=1e-12)
+    assert not found.y.any()
+    assert not found.heading.any()
+
+
+def test_a_batch_is_its_rows():
+    rng = np.random.default_rng(1)
+    rows = rng.uniform(0.1, 3.0, size=(3, 4, LAYOUT.size))
+    batch = local_reference(LAYOUT.unpack(rows), PERIOD)
+    single = local_reference(LAYOUT.unpack(rows[2, 1]), PERIOD)
+    for many, one in zip(batch, single, strict=True):
+        assert many.shape == (3, 4, 21)
+        np.testing.assert_allclose(many[2, 1], one, rtol=1e-12)
+
+
+def test_points_between_behind_and_beyond():
+    radius = 10.0
+    found = local_reference(observed(5.0, 1.0 / radius, 5.0), PERIOD)
+    for s in (0.0, 0.13, 2.2, 4.999, 5.0):
+        point = point_at(found, s)
+        assert point.x == pytest.approx(radius * math.sin(s / radius), abs=1e-9)
+        assert point.y == pytest.approx(radius * (1.0 - math.cos(s / radius)), abs=1e-9)
+        assert point.heading == pytest.approx(s / radius)
+    assert point_at(found, -2.0) == pytest.approx((-2.0, 0.0, 0.0))
+    straight, end = point_at(found, 8.0), point_at(found, 5.0)
+    assert straight.heading == end.heading
+    assert straight.x == pytest.approx(end.x + 3.0 * math.cos(end.heading))
+    curved = point_at(found, 8.0, 1.0 / radius)
+    assert curved.x == pytest.approx(radius * math.sin(0.8))
+
+
+def test_mean_curvature_of_any_stretch():
+    curvature = np.repeat([0.0, 0.1], 10)
+    found = local_reference(observed(5.0, curvature, 5.0), PERIOD)
+    assert mean_curvature(found, 0.0, 2.0) == pytest.approx(0.0)
+    assert mean_curvature(found, 2.0, 3.0) == pytest.approx(0.05)
+    assert mean_curvature(found, 3.0, 50.0) == pytest.approx(0.1)
+    assert mean_curvature(found, 90.0, 99.0) == pytest.approx(0.1)
+    assert mean_curvature(found, -5.0, 0.0) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("vehicle", list(VEHICLES.values()), ids=list(VEHICLES))
+@pytest.mark.parametrize("speed", [1.0, 3.0, 10.0, 20.0])
+@pytest.mark.parametrize("curvature", [0.01, -0.04])
+def test_a_steady_turn_is_an_equilibrium_on_the_circle(vehicle, speed, curvature):
+    turn = steady_turn(curvature, speed, vehicle)
+    state = np.array([speed, speed * math.tan(turn.sideslip), 0.0, turn.yaw_rate, 0.0, 0.0])
+    rate = bicycle.derivative(state, np.array([0.0, turn.steering_angle]), vehicle)
+    if abs(turn.steering_angle) < vehicle.max_steering_angle:
+        np.testing.assert_allclose(rate[[bicycle.VY, bicycle.YAW_RATE]], 0.0, atol=2e-3)
+    assert turn.yaw_rate / math.hypot(state[0], state[1]) == pytest.approx(curvature)
+
+
+def test_steady_turns_agree_with_rajamani_for_small_angles():
+    vehicle = VEHICLES["course-car"]
+    turn = steady_turn(1e-4, 8.0, vehicle)
+    expected = 1e-4 * (vehicle.wheelbase + vehicle.understeer_gradient * 64.0)
+    assert turn.steering_angle == pytest.approx(expected, rel=1e-6)
+    assert steady_turn(0.1, 0.0, vehicle).yaw_rate == 0.0
+
+
+def test_a_transient_turn_settles():
+    vehicle = VEHICLES["m2-minibus"]
+    turn = steady_turn(0.05, 5.0, vehicle)
+    assert transient_turn(turn, turn.sideslip, 5.0, vehicle) == turn
+    # Entering a curve, the rear axle has not swung in: the front is turned less.
+    entering = transient_turn(turn, 0.0, 5.0, vehicle)
+    assert entering.steering_angle < turn.steering_angle
+    sideslip = 0.0
+    for _ in range(100):
+        sideslip = lagged_sideslip(turn, sideslip, 0.25, vehicle)
+    assert sideslip == pytest.approx(turn.sideslip)
+
+
+def test_only_corners_that_cannot_be_driven_are_begun_early():
+    limit = 0.08
+    assert early_turn(local_reference(observed(5.0, 0.15, 5.0), PERIOD), limit) == (0.0, 0.0, 0.0)
+    corner = np.zeros(20)
+    corner[4] = -0.8 / 0.25  # 0.8 rad to the right within 0.25 m, from 1 m ahead on
+    early = early_turn(local_reference(observed(5.0, corner, 5.0), PERIOD), limit)
+    assert early.heading == pytest.approx(-(0.4 - limit * 1.25))
+    assert early.lateral_offset == pytest.approx(-(early.heading**2) / (2.0 * limit))
+    assert early.curvature == -limit
+    corner[:] = 0.0
+    corner[19] = -0.8 / 0.25  # still too far away
+    later = early_turn(local_reference(observed(5.0, corner, 5.0), PERIOD), limit)
+    assert later.curvature == pytest.approx(0.0)
