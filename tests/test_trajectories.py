@@ -23,12 +23,12 @@ TABLE = {
 }
 # Ours: largest curvature (1/m) and duration (s); a change of these changes every benchmark.
 GOLDEN = {
-    "T1": (1 / 11, 129.28),
-    "T2": (1 / 10, 80.56),
-    "T3": (1 / 12, 142.91),
-    "T4": (1 / 10, 104.79),
-    "T5": (1 / 16, 223.15),
-    "T6": (1 / 26, 254.98),
+    "T1": (1 / 11, 130.10),
+    "T2": (1 / 10, 81.75),
+    "T3": (1 / 12, 143.78),
+    "T4": (1 / 10, 106.01),
+    "T5": (1 / 16, 224.30),
+    "T6": (1 / 26, 255.97),
 }
 STEERABLE = math.tan(math.pi / 6) / 5.0
 """1/m, at the longest wheelbase of 5 m."""

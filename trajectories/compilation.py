@@ -22,8 +22,19 @@ def source_digest(*folders: Path) -> str:
     digest = hashlib.sha256()
     for folder in folders:
         for file in sorted(folder.rglob("*.py")):
-            digest.update(file.name.encode() + b"\0" + file.read_bytes())
+            name = file.relative_to(folder.parent).as_posix()
+            digest.update(name.encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
+
+
+@cache
+def _warn_of_no_cache() -> None:
+    warnings.warn(
+        "numba finds no writable cache folder: compiling anew in this process "
+        "(set NUMBA_CACHE_DIR to a writable folder to avoid the wait)",
+        RuntimeWarning,
+        stacklevel=3,
+    )
 
 
 def compiled(function: Function) -> Function:
@@ -31,16 +42,11 @@ def compiled(function: Function) -> Function:
 
     Where no cache folder is writable it warns once and compiles in every process.
     """
-    options = {"error_model": "numpy", "fastmath": False}
+    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
     try:
         dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:
-        warnings.warn(
-            "numba finds no writable cache folder: compiling anew in this process "
-            "(set NUMBA_CACHE_DIR to a writable folder to avoid the wait)",
-            RuntimeWarning,
-            stacklevel=2,
-        )
+        _warn_of_no_cache()
         return numba.njit(**options)(function)  # type: ignore[no-any-return]
     here = Path(__file__).parent
     own = Path(function.__code__.co_filename).parent
