@@ -5,6 +5,7 @@ it passes through SB3's `evaluate_policy`, this project's rollouts and its repor
 makes such an agent from one method that controls a single vehicle.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
@@ -19,6 +20,9 @@ from trajectories import ReferencePath
 
 Action = NDArray[np.float32]
 Memory = TypeVar("Memory")
+
+STOP_DECELERATION = 2.0
+"""m/s^2 of a controlled stop."""
 
 
 class Agent(Protocol):
@@ -73,8 +77,8 @@ class DrivingTask:
 class TrackingAgent(ABC, Generic[Memory]):
     """An agent made from `control`, which drives one vehicle on one observation.
 
-    It keeps one memory per row of a batch; rows that `episode_start` marks get a new one. A subclass
-    defines `new_memory` if it remembers anything.
+    It keeps one memory per row of a batch; rows that `episode_start` marks get a new one. What an
+    observation with entries that are not finite gets is decided by `control_blind`.
     """
 
     def __init__(self, task: DrivingTask) -> None:
@@ -89,6 +93,23 @@ class TrackingAgent(ABC, Generic[Memory]):
     @abstractmethod
     def control(self, observation: TrackingObservation, memory: Memory) -> tuple[float, float]:
         """Acceleration (m/s^2) and steering angle (rad) for one observation; may write memory."""
+
+    def control_blind(
+        self,
+        observation: TrackingObservation,
+        memory: Memory,  # noqa: ARG002  for subclasses
+    ) -> tuple[float, float]:
+        """Inputs for an observation that is not finite: steering held, braking to a stop.
+
+        The memory is left alone: one NaN in an integral would stay there for good.
+        """
+        speed, steering = float(observation.longitudinal_speed), float(observation.steering_angle)
+        vehicle = self.task.vehicle
+        # Where the speed is unknown it rolls on: braking blindly would end in reverse.
+        speed = max(speed, 0.0) if math.isfinite(speed) else 0.0
+        # Half the jerk limit brings deceleration and speed to zero together.
+        braking = min(STOP_DECELERATION, math.sqrt(vehicle.max_jerk * speed))
+        return vehicle.rolling_deceleration - braking, steering if math.isfinite(steering) else 0.0
 
     @abstractmethod
     def new_memory(self) -> Memory:
@@ -135,7 +156,8 @@ class TrackingAgent(ABC, Generic[Memory]):
             self._memories = memories
         actions = np.empty((len(rows), 2), dtype=np.float32)
         for k, (row, memory) in enumerate(zip(rows, memories, strict=True)):
-            actions[k] = self.control(self.task.layout.unpack(row), memory)
+            control = self.control if np.isfinite(row).all() else self.control_blind
+            actions[k] = control(self.task.layout.unpack(row), memory)
         np.nan_to_num(actions, copy=False, nan=0.0)
         np.clip(actions, self._low, self._high, out=actions)
         return (actions[0] if values.ndim == 1 else actions), memories

@@ -2,6 +2,8 @@
 
 import difflib
 import importlib
+import inspect
+from collections.abc import Iterable
 from typing import Any
 
 import gymnasium
@@ -46,15 +48,39 @@ def agent_class(name: str) -> type[Any]:
     return found
 
 
+def check_settings(name: str, settings: Iterable[str]) -> None:
+    """Refuse settings that an agent's class does not take.
+
+    Raises
+    ------
+    ValueError
+        Naming the agent, its settings and the nearest.
+    """
+    cls = agent_class(name)
+    try:
+        parameters = list(inspect.signature(cls).parameters.values())[1:]
+    except (TypeError, ValueError):  # not a class, or one that does not tell
+        return
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return
+    known = [parameter.name for parameter in parameters]
+    for key in settings:
+        if key not in known:
+            nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
+            hint = f"; known: {', '.join(known)} (nearest: {nearest[0]})" if nearest else ""
+            raise ValueError(f"agent {name!r} has no setting {key!r}{hint}")
+
+
 def make(name: str, env: gymnasium.Env[Any, Any], **settings: Any) -> Agent:
     """Make an agent for an environment; `settings` are its class's keyword arguments.
 
     Raises
     ------
     ValueError
-        For an unknown name or setting.
+        For an unknown name or setting, or an environment of another kind.
     """
     cls = agent_class(name)
+    check_settings(name, settings)
     try:
         agent: Agent = cls(DrivingTask.of(env), **settings)
     except TypeError as error:

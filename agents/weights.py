@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 import os
-import tempfile
+import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,9 +56,10 @@ class TrackingWeights:
     @classmethod
     def from_array(cls, values: ArrayLike) -> "TrackingWeights":
         """Inverse of `as_array`."""
-        flat = np.asarray(values, dtype=np.float64).tolist()
-        if len(flat) != 10:
-            raise ValueError(f"10 weights are needed, not {len(flat)}")
+        array = np.asarray(values, dtype=np.float64)
+        if array.shape != (10,):
+            raise ValueError(f"10 weights are needed, not shape {array.shape}")
+        flat = array.tolist()
         return cls(tuple(flat[:4]), tuple(flat[4:8]), tuple(flat[8:]))
 
     def clipped(self) -> "TrackingWeights":
@@ -119,7 +120,7 @@ class WeightSchedule:
         chosen = self.bands.select(curvature, band)
         if self.blend == 0.0:
             return self.weights[chosen], chosen
-        sharpest = float(np.max(np.abs(curvature)))
+        sharpest = float(np.max(np.abs(curvature), initial=0.0))
         for k, edge in enumerate(self.bands.thresholds):
             low, high = edge * (1.0 - self.blend), edge * (1.0 + self.blend)
             if low < sharpest < high:
@@ -136,14 +137,17 @@ class WeightSchedule:
             "blend": self.blend,
             "provenance": dict(self.provenance),
         }
+        text = json.dumps(content, indent=2)
         file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(
-            "w", encoding="utf-8", dir=file.parent, suffix=".tmp", delete=False
-        ) as handle:
-            json.dump(content, handle, indent=2)
-            handle.flush()
-            os.fsync(handle.fileno())
-        Path(handle.name).replace(file)
+        temporary = file.with_name(f".{file.name}.{secrets.token_hex(4)}.tmp")
+        try:
+            with temporary.open("w", encoding="utf-8") as handle:
+                handle.write(text)
+                handle.flush()
+                os.fsync(handle.fileno())
+            temporary.replace(file)
+        finally:
+            temporary.unlink(missing_ok=True)
 
     @classmethod
     def read(cls, file: Path) -> "WeightSchedule":
@@ -158,15 +162,21 @@ class WeightSchedule:
             content = json.loads(Path(file).read_text(encoding="utf-8"))
             if content.get("format") != FORMAT:
                 raise ValueError(f"format is {content.get('format')!r}, not {FORMAT!r}")
-            bands = {
-                key: tuple(value) if isinstance(value, list) else value
-                for key, value in content["bands"].items()
-            }
+            bands = content["bands"]
             return cls(
-                CurvatureBands(**bands),
+                CurvatureBands(
+                    thresholds=tuple(float(edge) for edge in bands["thresholds"]),
+                    names=tuple(str(name) for name in bands["names"]),
+                    hysteresis=float(bands["hysteresis"]),
+                ),
                 tuple(TrackingWeights(**weights) for weights in content["weights"]),
                 float(content["blend"]),
-                content["provenance"],
+                dict(content["provenance"]),
             )
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"weight schedule {file}: {error}") from error
+        except KeyError as error:
+            raise ValueError(f"weight schedule {file}: no {error} in it") from error
+        except (
+            OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError,
+        ) as error:  # fmt: skip
+            reason = " ".join(str(error).split())
+            raise ValueError(f"weight schedule {file}: {reason}") from error

@@ -18,9 +18,6 @@ from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]
 
-STOP_DECELERATION = 2.0
-"""m/s^2 of the controlled stop."""
-
 
 @dataclass
 class NmpcMemory:
@@ -161,6 +158,14 @@ class IpoptNmpc(TrackingAgent[NmpcMemory]):
         memory.counts[solution.status.value] += 1
         return self._replace(observation, memory)
 
+    def control_blind(
+        self, observation: TrackingObservation, memory: NmpcMemory
+    ) -> tuple[float, float]:
+        """An observation that is not finite counts as a failed solve, its status NAN."""
+        memory.solution = Solution(Status.NAN, None, None, None, np.nan, 0, 0.0)
+        memory.counts[Status.NAN.value] += 1
+        return self._replace(observation, memory)
+
     def situation(self, observation: TrackingObservation) -> tuple[Array, Array, Array]:
         """The problem's parameters from an observation, in the frame of the path's foot point.
 
@@ -196,13 +201,12 @@ class IpoptNmpc(TrackingAgent[NmpcMemory]):
         memory.failures += 1
         memory.age += 1
         # Kept up to date on every rung, since Stanley's own memory belongs to a driven episode.
-        a, delta = self._fallback.control(observation, memory.fallback_memory)
+        seen = all(np.isfinite(entry).all() for entry in observation)
+        fallback = self._fallback.control if seen else self._fallback.control_blind
+        a, delta = fallback(observation, memory.fallback_memory)
         if memory.failures > self.max_failures:
             memory.fallback = "stop"
-            speed = float(observation.longitudinal_speed)
-            a = self.task.vehicle.rolling_deceleration - min(
-                STOP_DECELERATION, max(speed, 0.0) / self.task.control_period
-            )
+            a, _ = super().control_blind(observation, memory)
         elif memory.plan is not None and memory.age < len(memory.plan):
             memory.fallback = "plan"
             a, delta = (float(value) for value in memory.plan[memory.age])
@@ -212,9 +216,9 @@ class IpoptNmpc(TrackingAgent[NmpcMemory]):
         return a, delta
 
     def diagnostics(self, memory: NmpcMemory) -> dict[str, Any]:
-        """Last solve of one vehicle: status, seconds, iterations, cost, slack (3,), plan (N + 1, 2).
+        """Last solve of one vehicle: status, seconds, iterations, cost, slack (3,), plan.
 
-        `plan` holds the predicted positions in the frame of the path's foot point.
+        `plan` (N + 1, 2) holds the predicted positions in the frame of the path's foot point.
         """
         solution = memory.solution
         if solution is None:

@@ -50,7 +50,7 @@ WARM_OPTIONS: dict[str, Any] = {
 
 
 def lpv_field(state: Any, action: Any, problem: NmpcProblem) -> Any:
-    """x' = A(x, u) x + B(x, u) u on CasADi symbols."""
+    """The field x' = A(x, u) x + B(x, u) u on CasADi symbols."""
     a_matrix, b_matrix = lpv.casadi_matrices(state, action, problem.vehicle)
     return ca.mtimes(a_matrix, state) + ca.mtimes(b_matrix, action)
 
@@ -91,7 +91,9 @@ class CasadiSolver:
         reference = ca.SX.sym("reference", OUTPUTS, n + 1)
         weights = ca.SX.sym("weights", 2 * OUTPUTS + INPUTS)
         q, s, r = ca.vertsplit(weights, [0, OUTPUTS, 2 * OUTPUTS, 2 * OUTPUTS + INPUTS])
-        variables, constraints, lower, upper = [], [], [], []
+        variables, constraints = [], []
+        lower: list[float] = []
+        upper: list[float] = []
         low_u, high_u = problem.input_bounds
         low_v, high_v = problem.vehicle.speed_range
         low_dv, high_dv = problem.vehicle.longitudinal_acceleration_range
@@ -162,7 +164,7 @@ class CasadiSolver:
     def _build(
         nlp: dict[str, Any], ipopt: dict[str, Any], max_seconds: float, **functions: ca.Function
     ) -> ca.Function:
-        options = {
+        options: dict[str, Any] = {
             "ipopt": {**ipopt, "max_wall_time": max_seconds},
             "expand": True,
             "print_time": False,
@@ -179,10 +181,10 @@ class CasadiSolver:
         weights: Array,
         warm: "WarmStart | None" = None,
     ) -> tuple[Solution, "WarmStart | None"]:
-        """Solve from `state` (6,), with the input in force (2,), reference (N + 1, 4), weights (10,).
+        """Solve from `state` (6,), with the input in force (2,) and the weights (10,).
 
-        `warm` is what the last solve returned; it is shifted by one period here. Never raises: what
-        goes wrong is in the status.
+        `reference` is (N + 1, 4). `warm` is what the last solve returned; it is shifted by one
+        period here. Never raises: what goes wrong is in the status.
         """
         n = self.problem.horizon
         began = time.perf_counter()

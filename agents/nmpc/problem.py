@@ -7,7 +7,7 @@ u = [a, delta], output y = C x = [vx, psi, X, Y] (kumar2025lpv, section III)::
     e_i = reference_i - C x_i
     x_{i+1} = F(x_i, u_i)                        Runge-Kutta steps of x' = A(x, u) x + B(x, u) u
     |delta_i| <= delta_max,  a_min <= a_i <= a_max
-    |delta_i - delta_{i-1}| <= Ts delta'_max,  |a_i - a_{i-1}| <= Ts a'_max     (u_{-1}: in force now)
+    |delta_i - delta_{i-1}| <= Ts delta'_max,  |a_i - a_{i-1}| <= Ts a'_max   (u_{-1}: in force now)
     vx_min <= vx_i <= vx_max        (soft)       i = 1..N
     |vy_i| <= ratio vx_i            (soft)       i = 1..N
     vx'_min <= vx'(x_i, u_i) <= vx'_max (soft)   i = 0..N-1

@@ -1,0 +1,189 @@
+"""One case: a small plain dict in, a plain dict out. A benchmark is a list of cases."""
+
+import hashlib
+import inspect
+import json
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import agents
+import lpv_track_env
+import trajectories
+from agents.registry import check_settings
+from experiments import metrics
+from experiments.rollout import Rollout, rollout
+from lpv_track_env import vehicle
+from lpv_track_env.env import PathTrackingEnv
+from lpv_track_env.task import SPEED_MODES, choose
+from trajectories.compilation import source_digest
+
+VEHICLE_FIELDS = tuple(field.name for field in fields(vehicle.VehicleParameters))
+ENV_SETTINGS = tuple(
+    parameter.name
+    for parameter in inspect.signature(PathTrackingEnv).parameters.values()
+    if parameter.kind is parameter.KEYWORD_ONLY
+)
+"""What `env_settings` may hold; the environment's other arguments are fields of the case."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Everything that determines one episode.
+
+    `vehicle_changes` replaces fields of the vehicle, for the plant and the agents' models alike
+    (say, a wider `max_lateral_velocity_ratio`); `agent_settings` and `env_settings` are keyword
+    arguments of the agent's class and of the environment.
+    """
+
+    agent: str
+    trajectory: str
+    vehicle: str = "m2-minibus"
+    conditions: str = "simulation"
+    seed: int = 0
+    speed_mode: str = "variable"
+    fixed_speed: float | None = None
+    control_period: float = 0.05
+    vehicle_changes: Mapping[str, Any] = field(default_factory=dict)
+    agent_settings: Mapping[str, Any] = field(default_factory=dict)
+    env_settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+    @property
+    def id(self) -> str:
+        """Hash of the case, the files it names and the project's sources: none changes unseen."""
+        named = (Path(self.trajectory), Path(self.vehicle))
+        files = [hashlib.sha256(file.read_bytes()).hexdigest() for file in named if file.is_file()]
+        content = json.dumps([self.as_dict(), files, project_digest()], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+    def check(self) -> None:
+        """Refuse names and settings that nothing knows, before anything is driven.
+
+        Raises
+        ------
+        ValueError
+            Listing the known names and the nearest.
+        """
+        check_settings(self.agent, self.agent_settings)
+        vehicle.load(self.vehicle)
+        trajectories.load(self.trajectory)
+        choose("speed mode", self.speed_mode, SPEED_MODES)
+        for key in self.env_settings:
+            choose("environment setting", key, ENV_SETTINGS)
+        for key in self.vehicle_changes:
+            choose("vehicle field", key, VEHICLE_FIELDS)
+
+    def make_env(self, **settings: Any) -> gymnasium.Env[Any, Any]:
+        """The case's environment; `settings` are added to the case's own."""
+        car = vehicle.load(self.vehicle)
+        if self.vehicle_changes:
+            changes = {
+                key: tuple(value) if isinstance(value, list) else value
+                for key, value in self.vehicle_changes.items()
+            }
+            car = car.replace(**changes)
+        return gymnasium.make(
+            "lpv_track_env/PathTracking-v0",
+            trajectory=self.trajectory,
+            vehicle=car,
+            speed_mode=self.speed_mode,
+            fixed_speed=self.fixed_speed,
+            conditions=self.conditions,
+            control_period=self.control_period,
+            **{**self.env_settings, **settings},
+        )
+
+    def make_agent(self, env: gymnasium.Env[Any, Any]) -> agents.Agent:
+        """The case's agent for its environment."""
+        return agents.make(self.agent, env, **self.agent_settings)
+
+
+@cache
+def project_digest() -> str:
+    """Digest of all sources that a result depends on."""
+    packages = (trajectories, lpv_track_env, agents)
+    folders = [Path(str(package.__file__)).parent for package in packages]
+    here = Path(__file__).parent
+    own = "".join((here / name).read_text() for name in ("cases.py", "rollout.py", "metrics.py"))
+    return hashlib.sha256((source_digest(*folders) + own).encode()).hexdigest()[:16]
+
+
+def run_case(spec: Mapping[str, Any]) -> dict[str, Any]:
+    """Run one case; never raises for what the case itself does wrong.
+
+    Parameters
+    ----------
+    spec
+        Fields of `Case`.
+
+    Returns
+    -------
+    dict
+        `id`, the spec's fields, `status` ("ok" or "failed" with `error`), `end`, `metrics`,
+        `solver` (median, p99, max time in s; failures), `warnings`, `seconds`, and `trace`, arrays
+        by name.
+    """
+    case = Case(**spec)
+    result: dict[str, Any] = {"id": case.id, **case.as_dict(), "status": "ok", "end": None}
+    began = time.perf_counter()
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            env = case.make_env()
+            driven = rollout(env, case.make_agent(env), seed=case.seed)
+            car = env.unwrapped.vehicle  # type: ignore[attr-defined]
+            env.close()
+        measured = metrics.evaluate(driven.trace, driven.path, car)
+        if bad := sorted(name for name, value in measured.items() if not np.isfinite(value)):
+            raise ValueError(f"metrics not finite: {', '.join(bad)}")
+    except Exception as error:  # noqa: BLE001  a failed case must not end a sweep
+        return {
+            **result,
+            "status": "failed",
+            "error": f"{type(error).__name__}: {error}",
+            "metrics": {},
+            "solver": {},
+            "warnings": [],
+            "seconds": time.perf_counter() - began,
+            "trace": {},
+        }
+    noted = [str(warning.message) for warning in caught if warning.category is UserWarning]
+    return {
+        **result,
+        "end": driven.end,
+        "metrics": measured,
+        "solver": solver_summary(driven),
+        "warnings": sorted({*noted, *driven.path.metadata.get("warnings", [])}),
+        "seconds": time.perf_counter() - began,
+        "trace": driven.trace.as_dict(),
+    }
+
+
+def solver_summary(driven: Rollout) -> dict[str, Any]:
+    """Times of `predict` (s) over an episode, and what its solves came to.
+
+    The first call, which may still compile or allocate, counts like every other.
+    """
+    calls = driven.trace.solve_time[1:]
+    return {
+        "median": float(np.median(calls)),
+        "p99": float(np.percentile(calls, 99)),
+        "max": float(calls.max()),
+        "failures": sum(n for status, n in driven.statuses.items() if status != "SUCCESS"),
+        "statuses": driven.statuses,
+        "fallbacks": driven.fallbacks,
+        "mean_iterations": float(driven.iterations.mean()) if driven.iterations.size else None,
+        "solves": int(driven.solver_seconds.size),
+        "slack": driven.slack.tolist() if driven.solver_seconds.size else None,
+    }

@@ -1,0 +1,578 @@
+"""`report.html` from a results folder alone: nothing is driven again, nothing is fetched."""
+
+import html
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from experiments import figures, published, tables
+from experiments.figures import Drive, Panel, Styles
+from experiments.results import ResultStore, write_atomically
+
+Result = Mapping[str, Any]
+
+ERRATA = (
+    "A[vy, vy] is printed with the front stiffness twice; the field gives Car + Caf cos δ.",
+    "B is printed with its columns in the order [δ, a], while u = [a, δ].",
+    (
+        "The text bounds dvx/dt by 2 m/s², the derived row by 1; the table's own trajectories "
+        "need up to 2.01. We take 2."
+    ),
+    "The section is titled kinematic; the model is the dynamic bicycle.",
+    (
+        "Ts, N, the vehicle's parameters and the weights are not given. The rate limits are per "
+        "step: we take Ts = 0.02 s for them (0.5236 rad/s, 5 m/s³) and keep them as physical "
+        "rates."
+    ),
+    (
+        "The reference velocities are rotated with a sign that does not give the tangential "
+        "speed; the tangential speed is meant."
+    ),
+    (
+        "“Average” lateral and orientation errors are root mean squares by formula. By the "
+        "formulas Max CTE equals MLE and Mean CTE never exceeds ALE, yet the published table "
+        "has Mean CTE above ALE everywhere: its reference point must be another one, for "
+        "example by the clock. The distance by the clock is given separately."
+    ),
+    (
+        "The published maximum curvatures (up to 4.0 1/m) cannot be driven: |δ| ≤ π/6 allows "
+        "0.175 1/m at a wheelbase of 3.3 m. The drivable trajectories match the other rows; the "
+        "Tn-raw ones have kinks that match the curvature rows."
+    ),
+    (
+        "The parallel nodes are said to cut latency; the paper gives no figure. Solve times are "
+        "measured here."
+    ),
+)
+"""Where kumar2025lpv contradicts itself or leaves something out, and the reading taken."""
+
+FIGURES: tuple[tuple[str, str, Callable[[Sequence[Drive], Styles, str], list[Panel]]], ...] = (
+    ("Paths", "Reference broad and grey, start ●, an end before the path's ×.", figures.paths),
+    ("Lateral error", "Left of the path is positive. Scales differ between panels.",
+     figures.lateral_error),
+    ("Heading error", "Less the path's heading, in (−π, π]; on a bend sideslip keeps it from zero.",
+     figures.heading_error),
+    ("Speed", "Over arc length; the path's reference speed broad and grey.", figures.speed),
+    ("Inputs", "Steering angle and acceleration in force, after the actuators.", figures.inputs),
+    ("Time of predict", "Whole calls: line over all, bar 5 to 95 %, tick the median, circle 99 %.",
+     figures.solve_times),
+)  # fmt: skip
+"""Heading, caption and function of every figure that is drawn for each setting."""
+
+PAGE = Template("""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>$title</title>
+<style>
+:root { --ink: #1b1f24; --soft: #57606a; --page: #ffffff; --card: #f6f8fa; --line: #d0d7de;
+  --accent: #0a58a8; --bad: #b00020; color-scheme: light dark; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e6edf3; --soft: #9da7b1; --page: #0d1117; --card: #161b22; --line: #30363d;
+    --accent: #6cb6ff; --bad: #ff7b8a; } }
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--page); color: var(--ink);
+  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
+main { max-width: 1320px; margin: 0 auto; padding: 1rem clamp(0.75rem, 3vw, 2rem) 4rem; }
+p, li, dd, dt { max-width: 46rem; overflow-wrap: anywhere; }
+h1 { font-size: 1.7rem; line-height: 1.2; margin: 1rem 0 0.25rem; }
+h2 { font-size: 1.3rem; margin: 2.75rem 0 0.5rem; padding-top: 0.75rem;
+  border-top: 1px solid var(--line); }
+h3 { font-size: 1.05rem; margin: 1.75rem 0 0.5rem; overflow-wrap: anywhere; }
+h4 { font-size: 0.95rem; margin: 1.25rem 0 0.35rem; }
+a { color: var(--accent); }
+nav { display: flex; flex-wrap: wrap; gap: 0.25rem 1rem; margin: 0.75rem 0 0; }
+small, .soft, figcaption { color: var(--soft); }
+.wide { overflow-x: auto; margin: 0.5rem 0 0.75rem; }
+table { border-collapse: collapse; font-size: 0.875rem; font-variant-numeric: tabular-nums; }
+th, td { padding: 0.25rem 0.65rem; text-align: left; vertical-align: baseline;
+  border-bottom: 1px solid var(--line); overflow-wrap: break-word; }
+thead th { vertical-align: bottom; font-weight: 600; border-bottom: 2px solid var(--line); }
+thead small { display: block; font-weight: 400; }
+td.n, th.n { text-align: right; white-space: nowrap; }
+thead th.n { white-space: normal; }
+td.who { white-space: nowrap; }
+td.t { min-width: 5rem; } td.t:last-child { min-width: 9rem; }
+@media (max-width: 600px) { th, td { padding: 0.2rem 0.4rem; } table { font-size: 0.8125rem; } }
+th[scope="row"], td:first-child { white-space: nowrap; }
+.grouped td, .grouped tbody th { border-bottom: 0; }
+.grouped tr.first > * { border-top: 1px solid var(--line); }
+.grouped tr.published > td { color: var(--soft); font-style: italic; }
+dl.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.5rem, 1fr));
+  gap: 0.6rem; margin: 1rem 0; }
+dl.tiles div { background: var(--card); border: 1px solid var(--line); border-radius: 6px;
+  padding: 0.5rem 0.75rem; }
+dl.tiles dt { color: var(--soft); font-size: 0.8rem; }
+dl.tiles dd { margin: 0; font-size: 1.25rem; font-weight: 600; }
+.legend { display: flex; flex-wrap: wrap; gap: 0.2rem 1.1rem; margin: 0.4rem 0; padding: 0;
+  list-style: none; font-size: 0.875rem; }
+.legend svg { width: 30px; height: 10px; vertical-align: middle; margin-right: 0.35rem;
+  background: #fff; border-radius: 2px; }
+.panels { display: grid; gap: 0.75rem; margin: 0.5rem 0 0.5rem;
+  grid-template-columns: repeat(auto-fill, minmax(min(100%, 330px), 1fr)); }
+figure { margin: 0; padding: 0.35rem 0.5rem 0.5rem; background: #fff; color: #1b1f24;
+  border: 1px solid var(--line); border-radius: 6px; break-inside: avoid; }
+figure figcaption { color: #1b1f24; font-weight: 600; font-size: 0.875rem; }
+figure svg { display: block; width: 100%; max-width: 640px; height: auto; }
+figure svg text { font-family: system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans",
+  sans-serif; }
+.bad { color: var(--bad); }
+pre { overflow-x: auto; background: var(--card); border: 1px solid var(--line);
+  border-radius: 6px; padding: 0.6rem 0.8rem; font-size: 0.85rem; }
+@media print {
+  :root { --ink: #000; --soft: #444; --page: #fff; --card: #fff; --line: #bbb; --accent: #000;
+    --bad: #900; }
+  body { font-size: 10pt; } nav { display: none; } main { max-width: none; padding: 0; }
+  .wide { overflow: visible; } table { font-size: 8pt; } th, td { padding: 0.15rem 0.35rem; }
+  tr { break-inside: avoid; } h2, h3, h4 { break-after: avoid; }
+  .panels { grid-template-columns: repeat(2, 1fr); } }
+</style>
+</head>
+<body><main>
+<h1>$title</h1>
+<p class="soft">$subtitle</p>
+<nav>$contents</nav>
+$body
+</main></body>
+</html>
+""")
+
+
+def write_report(folder: Path) -> Path:
+    """Build `report.html` in a results folder from what the folder holds, and return its path.
+
+    Raises
+    ------
+    ValueError
+        If the folder holds no cases, or a damaged line other than the last.
+    """
+    none = f"no results in {folder}: run lpv-track benchmark --out {folder} first"
+    if not (folder / "cases.jsonl").is_file():
+        raise ValueError(none)
+    store = ResultStore(folder)
+    cases = store.cases()
+    if not cases:
+        raise ValueError(none)
+    file = folder / "report.html"
+    write_atomically(file, build(cases, store).encode())
+    return file
+
+
+def build(cases: Sequence[Result], store: ResultStore) -> str:
+    """The page as text."""
+    kept = tables.ordered(tables.current(cases))
+    manifest = store.manifest()
+    drives, missing = drives_of(kept, store)
+    styles = figures.line_styles(tables.labels(kept))
+    failed = [case for case in kept if case.get("status") != "ok"]
+    sections = {
+        "Summary": summary(kept, len(cases) - len(kept)),
+        "Against the published table": comparison(kept),
+        "Figures": figure_section(drives, styles, missing),
+        "Where the sideslip limit forbids the path": constraint_section(kept, drives, styles),
+        **({"Failed cases": failure_section(failed)} if failed else {}),
+        "Warnings": warning_section(kept),
+        "Errata of the paper": errata_section(),
+        "Settings and provenance": manifest_section(manifest, kept),
+    }
+    present = {title: content for title, content in sections.items() if content}
+    contents = "".join(
+        f'<a href="#s{number}">{html.escape(title)}</a>'
+        for number, title in enumerate(present, start=1)
+    )
+    body = "\n".join(
+        f'<section id="s{number}"><h2>{html.escape(title)}</h2>\n{content}\n</section>'
+        for number, (title, content) in enumerate(present.items(), start=1)
+    )
+    return PAGE.substitute(
+        title="Path tracking benchmark",
+        subtitle=html.escape(subtitle(manifest)),
+        contents=contents,
+        body=body,
+    )
+
+
+def subtitle(manifest: Mapping[str, Any]) -> str:
+    """When and from which revision, as far as the manifest tells."""
+    parts = ["LPV-NMPC after kumar2025lpv and other agents on lpv-track-env"]
+    if written := manifest.get("written"):
+        parts.append(str(written))
+    revision = manifest.get("revision")
+    if isinstance(revision, Mapping) and revision.get("commit"):
+        modified = ", with changes" if revision.get("modified") else ""
+        parts.append(f"revision {str(revision['commit'])[:12]}{modified}")
+    return " · ".join(parts)
+
+
+def paragraph(text: str, kind: str = "") -> str:
+    """A paragraph of escaped text."""
+    return f'<p class="{kind}">{html.escape(text)}</p>' if kind else f"<p>{html.escape(text)}</p>"
+
+
+def drives_of(cases: Iterable[Result], store: ResultStore) -> tuple[list[Drive], list[Result]]:
+    """What can be drawn: of each agent, setting and trajectory the first seed; and what lacks."""
+    drives: dict[tuple[str, str, str], Drive] = {}
+    missing: list[Result] = []
+    for case in cases:
+        label, path = tables.label_of(case), str(case.get("trajectory"))
+        key = tables.setting_of(case), path, label
+        if case.get("status") != "ok" or key in drives:
+            continue
+        trace = store.trace(str(case["id"]))
+        if trace is None or not figures.usable(trace):
+            missing.append(case)
+            continue
+        drives[key] = Drive(label, path, case, trace)
+    return list(drives.values()), missing
+
+
+def _settings(drives: Iterable[Drive]) -> dict[str, list[Drive]]:
+    groups: dict[str, list[Drive]] = {}
+    for drive in drives:
+        groups.setdefault(tables.setting_of(drive.case), []).append(drive)
+    return groups
+
+
+# Summary
+
+
+def summary(cases: Sequence[Result], superseded: int) -> str:
+    """What was run, and key figures of each agent."""
+    done = [case for case in cases if case.get("status") == "ok"]
+    finished = sum(case.get("end") == "finished" for case in done)
+    late = [case for case in done if _too_slow(case)]
+    tiles = {
+        "cases": f"{len(cases)}",
+        "drove the whole path": f"{finished} of {len(cases)}",
+        "failed": f"{len(cases) - len(done)}",
+        "agents": f"{len({tables.label_of(case) for case in cases})}",
+        "trajectories": f"{len({str(case.get('trajectory')) for case in cases})}",
+        "seeds": f"{len({case.get('seed') for case in cases})}",
+        "p99 of predict over the control period": f"{len(late)} of {len(done)}",
+        "time driven": f"{sum(case['metrics'].get('duration', 0.0) for case in done) / 60:.0f} min",
+        "computing time": f"{sum(case.get('seconds') or 0.0 for case in cases) / 60:.1f} min",
+    }
+    parts = [
+        '<dl class="tiles">'
+        + "".join(
+            f"<div><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>"
+            for name, value in tiles.items()
+        )
+        + "</dl>"
+    ]
+    if superseded:
+        parts.append(
+            paragraph(
+                f"{superseded} older results of the same cases, run from other sources, are in the "
+                "folder and left out."
+            )
+        )
+    for setting, group in _cases_by_setting(cases).items():
+        parts.append(f"<h3>{html.escape(setting)}</h3>")
+        parts.append(key_figures(group))
+    parts.append(
+        paragraph(
+            "ALE and MLE over the trajectories of the setting, of all runs that did not fail; an "
+            "episode that ended early counts for the part it drove. “ALE against published” "
+            "is the mean over T1 to T6 of ours divided by the published simulation value.",
+            "soft",
+        )
+    )
+    return "\n".join(parts)
+
+
+def _cases_by_setting(cases: Iterable[Result]) -> dict[str, list[Result]]:
+    groups: dict[str, list[Result]] = {}
+    for case in cases:
+        groups.setdefault(tables.setting_of(case), []).append(case)
+    return groups
+
+
+def _too_slow(case: Result) -> bool:
+    return bool(case["solver"].get("p99", 0.0) > case.get("control_period", np.inf))
+
+
+def key_figures(cases: Sequence[Result]) -> str:
+    """Table of one setting: an agent a line, over all its trajectories and seeds."""
+    lines = []
+    for label in tables.labels(cases):
+        group = [case for case in cases if tables.label_of(case) == label]
+        done = [case for case in group if case.get("status") == "ok"]
+        finished = sum(case.get("end") == "finished" for case in group)
+        line = [label, f"{finished} of {len(group)}"]
+        if not done:
+            lines.append([*line, *["–"] * 7])
+            continue
+        metrics = [case["metrics"] for case in done]
+        worst = max(done, key=lambda case: case["metrics"]["mle"])
+        kept = sum(not tables.violated(one) for one in metrics)
+        medians = [case["solver"]["median"] for case in done]
+        lines.append(
+            [
+                *line,
+                f"{np.mean([one['ale'] for one in metrics]):.3f}",
+                f"{worst['metrics']['mle']:.3f} ({worst.get('trajectory')})",
+                f"{np.mean([one['aoe'] for one in metrics]):.3f}",
+                _against_published(done),
+                f"{1e3 * np.median(medians):.2f}",
+                f"{1e3 * max(case['solver']['p99'] for case in done):.2f}",
+                f"{kept} of {len(done)}",
+            ]
+        )
+    headings = (
+        "agent", "whole path", "mean ALE, m", "worst MLE, m (path)", "mean AOE, rad",
+        "ALE against published", "median predict, ms", "worst p99, ms", "all constraints kept",
+    )  # fmt: skip
+    return tables.html_table(headings, lines, range(1, 9))
+
+
+def _against_published(cases: Iterable[Result]) -> str:
+    shares = [
+        case["metrics"]["ale"] / row["ale"]
+        for case in cases
+        if case.get("trajectory") in published.SIMULATION
+        and (row := published.row(str(case["trajectory"]))) is not None
+    ]
+    return f"{100 * np.mean(shares):.0f} %" if shares else "–"
+
+
+# Tables and figures
+
+
+def comparison(cases: Sequence[Result]) -> str:
+    """The tables of every setting."""
+    parts = [
+        paragraph(
+            f"{tables.PUBLISHED_NOTE} Max CTE and MLE, by formula the same, use the foot point on "
+            "the path. Several seeds (×n): mean ± 95 % interval by the t-distribution."
+        )
+    ]
+    for setting, text in tables.html_tables(cases).items():
+        parts.append(f"<h3>{html.escape(setting)}</h3>\n{text}")
+    return "\n".join(parts)
+
+
+def legend(styles: Styles, labels: Iterable[str]) -> str:
+    """Agents with their lines."""
+    dashes = {"solid": "", "dashed": "6 3", "dotted": "1.5 2.5", "dashdot": "6 2.5 1.5 2.5"}
+    return (
+        '<ul class="legend">'
+        + "".join(
+            f'<li><svg viewBox="0 0 30 10" aria-hidden="true"><line x1="1" y1="5" x2="29" y2="5" '
+            f'stroke="{styles[label].colour}" stroke-width="2.5" '
+            f'stroke-dasharray="{dashes[styles[label].dashes]}"/></svg>{html.escape(label)}</li>'
+            for label in styles
+            if label in set(labels)
+        )
+        + "</ul>"
+    )
+
+
+def panel_grid(panels: Iterable[Panel], what: str) -> str:
+    """Panels beside each other as the page's width allows."""
+    return (
+        '<div class="panels">\n'
+        + "\n".join(
+            f'<figure role="img" aria-label="{html.escape(f"{what}: {panel.title}")}">'
+            f"<figcaption>{html.escape(panel.title)}</figcaption>{panel.svg}</figure>"
+            for panel in panels
+        )
+        + "\n</div>"
+    )
+
+
+def figure_section(drives: Sequence[Drive], styles: Styles, missing: Sequence[Result]) -> str:
+    """All figures, setting by setting."""
+    parts = []
+    if any(drive.case.get("seed") for drive in drives):
+        parts.append(paragraph("Of several seeds the first is drawn."))
+    if missing:
+        names = ", ".join(
+            f"{tables.label_of(case)} on {case.get('trajectory')} (seed {case.get('seed')})"
+            for case in missing
+        )
+        parts.append(paragraph(f"Not drawn, for want of a readable trace: {names}.", "bad"))
+    for number, (setting, group) in enumerate(_settings(drives).items()):
+        parts.append(f"<h3>{html.escape(setting)}</h3>")
+        shown = legend(styles, {drive.label for drive in group})
+        if len({drive.trajectory for drive in group}) == 1:
+            parts.append(shown + _one_grid(group, styles, f"f{number}"))
+            continue
+        for heading, caption, draw in FIGURES:
+            parts.append(f"<h4>{html.escape(heading)}</h4>")
+            parts.append(paragraph(caption, "soft") + shown)
+            parts.append(panel_grid(draw(group, styles, f"f{number}"), heading))
+    return "\n".join(parts)
+
+
+def _one_grid(group: Sequence[Drive], styles: Styles, salt: str) -> str:
+    """All figures of a setting with a single trajectory beside each other."""
+    panels = [
+        Panel(f"{heading}, {panel.title}", panel.svg)
+        for heading, _, draw in FIGURES
+        for panel in draw(group, styles, salt)
+    ]
+    captions = " ".join(f"{heading}: {caption}" for heading, caption, _ in FIGURES)
+    return panel_grid(panels, "Figure") + paragraph(captions, "soft")
+
+
+def constraint_section(cases: Sequence[Result], drives: Sequence[Drive], styles: Styles) -> str:
+    """Where |vy| <= 0.17 vx stops a vehicle from following the path, and what that costs."""
+    parts = [
+        paragraph(
+            "The paper bounds |vy| by 0.17 vx at the centre of gravity. In a steady turn vy/vx is "
+            "κ (lr − m lf v² / (L Car)), at low speed about lr κ: the bound is a limit on the "
+            "curvature that may be driven, whatever the speed. On sharper bends a controller that "
+            "keeps it must leave the path, and one that follows the path must break it. The "
+            "published errors (MLE 0.7 to 1.6 m, MOE 0.3 to 0.6 rad) look like that limit at work."
+        )
+    ]
+    lines = [
+        [str(name), f"{limit:.2f}", f"{limit / lever:.3f}"] for name, limit, lever in _limits(cases)
+    ]
+    if lines:
+        parts.append(
+            tables.html_table(
+                ("vehicle", "limit on |vy|/vx", "curvature limit at low speed, 1/m"), lines, (1, 2)
+            )
+        )
+    reached = [case for case in cases if figures.reaches_sideslip_limit(case)]
+    if not reached:
+        parts.append(paragraph("No case broke the limit or needed slack on it."))
+        return "\n".join(parts)
+    parts.append(
+        paragraph(
+            "Cases that broke it, or whose plans needed slack on it. “Needed” is the share "
+            "of the path's length whose curvature asks for more than the limit at the path's own "
+            "speed; “at the limit” is the length driven at 99 % of it or more."
+        )
+    )
+    by_id = {drive.case["id"]: drive for drive in drives}
+    parts.append(_limit_table(reached, by_id))
+    drawn = [by_id[case["id"]] for case in reached if case["id"] in by_id]
+    for number, (setting, group) in enumerate(_settings(drawn).items()):
+        parts.append(f"<h3>{html.escape(setting)}</h3>")
+        parts.append(
+            paragraph(
+                "Above: |vy|/vx driven, its limit (dashed), what the path needs (grey), and where "
+                "that is over the limit (shaded). Below: the path, red where the limit is reached.",
+                "soft",
+            )
+        )
+        parts.append(legend(styles, {drive.label for drive in group}))
+        panels = figures.sideslip_limit(group, styles, f"c{number}")
+        parts.append(panel_grid(panels, "Sideslip limit"))
+    return "\n".join(parts)
+
+
+def _limits(cases: Iterable[Result]) -> list[tuple[str, float, float]]:
+    """Name, limit on |vy|/vx and lr of every vehicle that still loads."""
+    found: dict[tuple[str, float, float], None] = {}
+    for case in cases:
+        car = figures.plant(case)
+        if car is not None:
+            key = str(case.get("vehicle")), car.max_lateral_velocity_ratio, car.rear_axle_distance
+            found[key] = None
+    return sorted(found)
+
+
+def _limit_table(cases: Iterable[Result], drives: Mapping[Any, Drive]) -> str:
+    lines = []
+    for case in cases:
+        metrics, slack = case["metrics"], case["solver"].get("slack")
+        drive = drives.get(case["id"])
+        lines.append(
+            [
+                tables.setting_of(case),
+                str(case.get("trajectory")),
+                tables.label_of(case),
+                str(case.get("seed")),
+                f"{metrics.get('excess_lateral_velocity', 0.0):.3f}",
+                f"{100 * metrics.get('violated_lateral_velocity', 0.0):.1f}",
+                f"{slack[1]:.3f}" if slack else "–",
+                *(_limit_lengths(drive) if drive else ("–", "–")),
+                f"{metrics['mle']:.3f}",
+            ]
+        )
+    headings = (
+        "setting", "path", "agent", "seed", "largest excess, m/s", "periods over, %",
+        "largest slack, m/s", "needed, %", "at the limit, m", "MLE, m",
+    )  # fmt: skip
+    return tables.html_table(headings, lines, range(3, 10))
+
+
+def _limit_lengths(drive: Drive) -> tuple[str, str]:
+    car, needed = figures.plant(drive.case), figures.required_sideslip(drive)
+    if car is None:
+        return "–", "–"
+    limit = car.max_lateral_velocity_ratio
+    share = "–" if needed is None else f"{100 * np.mean(needed[1] > limit):.1f}"
+    steps = np.hypot(*np.diff(drive.trace["state"][:, 4:6], axis=0).T)
+    at_limit = figures.sideslip(drive.trace)[1:] >= figures.AT_LIMIT * limit
+    return share, f"{steps[at_limit].sum():.1f}"
+
+
+# What went wrong, errata, provenance
+
+
+def failure_section(cases: Iterable[Result]) -> str:
+    """Cases that ended in an error instead of an episode."""
+    lines = [
+        [
+            str(case["id"]), tables.label_of(case), str(case.get("trajectory")),
+            tables.setting_of(case), str(case.get("seed")), str(case.get("error", "no message")),
+        ]
+        for case in cases
+    ]  # fmt: skip
+    return tables.html_table(("id", "agent", "path", "setting", "seed", "error"), lines)
+
+
+def warning_section(cases: Iterable[Result]) -> str:
+    """Each different warning once, with the number of cases that gave it."""
+    counts = Counter(text for case in cases for text in case.get("warnings") or [])
+    if not counts:
+        return ""
+    lines = [[text, str(count)] for text, count in sorted(counts.items())]
+    return tables.html_table(("warning", "cases"), lines, (1,))
+
+
+def errata_section() -> str:
+    """Readings that matter when our numbers are held against the paper's."""
+    items = "".join(f"<li>{html.escape(text)}</li>" for text in ERRATA)
+    return f"<ol>{items}</ol>"
+
+
+def manifest_section(manifest: Mapping[str, Any], cases: Sequence[Result]) -> str:
+    """Command, settings, revision, versions, hardware, seeds."""
+    parts = []
+    command = manifest.get("command")
+    if isinstance(command, list):
+        parts.append(f"<pre>{html.escape(' '.join(map(str, command)))}</pre>")
+    seeds = sorted({case.get("seed", 0) for case in cases})
+    lines = [["seeds", ", ".join(map(str, seeds))]]
+    if manifest:
+        lines += [
+            [key, value] for key, value in _flat({**manifest, "command": None}) if value != "None"
+        ]
+    else:
+        parts.append(paragraph("The folder has no readable manifest.json.", "bad"))
+    parts.append(tables.html_table(("entry", "value"), lines))
+    return "\n".join(parts)
+
+
+def _flat(value: Any, name: str = "") -> list[tuple[str, str]]:
+    """Leaves of nested mappings with their dotted names; lists in one line."""
+    if isinstance(value, Mapping):
+        return [
+            leaf
+            for key in sorted(value, key=str)
+            for leaf in _flat(value[key], f"{name}.{key}" if name else str(key))
+        ]
+    if isinstance(value, list):
+        return [(name, ", ".join(map(str, value)))]
+    return [(name, str(value))]

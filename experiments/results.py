@@ -1,0 +1,192 @@
+"""A folder of results: one fsynced JSON line a case, traces beside it, a manifest.
+
+Layout: `manifest.json` (revision, versions, settings, hardware), `cases.jsonl`, `traces/ID.npz`.
+A run that was killed resumes: a torn last line is dropped, of several lines with one id the last
+counts, and files are replaced atomically.
+"""
+
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import subprocess
+import sys
+import zipfile
+import zlib
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PACKAGES = ("lpv-track-env", "numpy", "scipy", "numba", "casadi", "gymnasium")
+OPTIONAL_PACKAGES = ("torch", "stable-baselines3", "highway-env")
+
+Array = NDArray[np.float64]
+
+
+def write_atomically(file: Path, content: bytes) -> None:
+    """Replace a file as a whole: temporary file in the same folder, fsync, rename."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as handle:
+            handle.write(content)
+            handle.flush()
+            os.fsync(handle.fileno())
+        temporary.replace(file)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+class ResultStore:
+    """Results of one benchmark in a folder, which is made if need be.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.cases_file = folder / "cases.jsonl"
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def append(self, result: Mapping[str, Any]) -> None:
+        """Keep one result: its trace first, then its line, both on disk when this returns."""
+        line = {key: value for key, value in result.items() if key != "trace"}
+        if result.get("trace"):
+            buffer = io.BytesIO()
+            arrays: dict[str, Any] = {
+                name: np.asarray(values) for name, values in result["trace"].items()
+            }
+            np.savez_compressed(buffer, **arrays)
+            write_atomically(self.folder / "traces" / f"{result['id']}.npz", buffer.getvalue())
+        self._drop_torn_line()
+        with self.cases_file.open("ab") as handle:
+            handle.write(json.dumps(line, sort_keys=True, allow_nan=False).encode() + b"\n")
+            handle.flush()
+            os.fsync(handle.fileno())
+
+    def _drop_torn_line(self) -> None:
+        """Cut what a killed writer left after the last complete line."""
+        if not self.cases_file.exists():
+            return
+        with self.cases_file.open("rb+") as handle:
+            size = handle.seek(0, os.SEEK_END)
+            if size == 0:
+                return
+            handle.seek(size - 1)
+            if handle.read(1) == b"\n":
+                return
+            handle.seek(0)
+            handle.truncate(handle.read().rfind(b"\n") + 1)
+
+    def cases(self) -> list[dict[str, Any]]:
+        """Results in the order of their first lines, without traces; the last line of an id counts.
+
+        Raises
+        ------
+        ValueError
+            For a line other than the last that is not JSON.
+        """
+        if not self.cases_file.exists():
+            return []
+        found: dict[str, dict[str, Any]] = {}
+        content = self.cases_file.read_bytes()
+        complete, _, _ = content.rpartition(b"\n")
+        for number, line in enumerate(complete.split(b"\n"), start=1):
+            if not line.strip():
+                continue
+            try:
+                result = json.loads(line)
+                found[result["id"]] = result
+            except (ValueError, KeyError, TypeError) as error:
+                message = f"{self.cases_file}, line {number}: not a case ({error})"
+                raise ValueError(message) from error
+        return list(found.values())
+
+    def trace(self, case_id: str) -> dict[str, Array] | None:
+        """Arrays of a case's trace by name, or None where it was not kept or cannot be read."""
+        file = self.folder / "traces" / f"{case_id}.npz"
+        try:
+            with np.load(file, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
+            return None
+
+    def write_manifest(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Write and return what a result must carry to be reproduced."""
+        manifest = {
+            "format": "lpv-track-results/1",
+            "written": datetime.now(UTC).isoformat(timespec="seconds"),
+            "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+            "settings": dict(settings),
+            "revision": revision(),
+            "versions": versions(),
+            "hardware": hardware(),
+        }
+        content = json.dumps(manifest, indent=2, sort_keys=True).encode()
+        write_atomically(self.folder / "manifest.json", content)
+        return manifest
+
+    def manifest(self) -> dict[str, Any]:
+        """The manifest, or {} where there is none."""
+        try:
+            content: dict[str, Any] = json.loads((self.folder / "manifest.json").read_text())
+        except (OSError, ValueError):
+            return {}
+        return content
+
+
+def revision() -> dict[str, Any]:
+    """Git revision of the sources, and whether they differ from it; None outside a checkout."""
+    here = Path(__file__).parent
+
+    def git(*arguments: str) -> str | None:
+        try:
+            done = subprocess.run(  # noqa: S603  fixed arguments
+                ["git", "-C", str(here), *arguments],  # noqa: S607
+                capture_output=True, text=True, timeout=10, check=False,
+            )  # fmt: skip
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    commit, changes = git("rev-parse", "HEAD"), git("status", "--porcelain", "--untracked-files=no")
+    return {"commit": commit, "modified": None if changes is None else bool(changes)}
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and the packages that results depend on."""
+    found = {"python": platform.python_version()}
+    for package in (*PACKAGES, *OPTIONAL_PACKAGES):
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def hardware() -> dict[str, Any]:
+    """Processor, cores, memory (GiB) and system."""
+    processor = platform.processor() or platform.machine()
+    memory = None
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+        processor = names[0] if names else processor
+        pages, size = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
+        memory = round(pages * size / 2**30, 1)
+    except (OSError, ValueError):
+        pass
+    return {
+        "processor": processor,
+        "cores": os.cpu_count(),
+        "memory_gib": memory,
+        "system": platform.system(),
+    }

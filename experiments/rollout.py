@@ -1,0 +1,139 @@
+"""One episode: an agent drives an environment, and everything worth knowing is recorded."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from agents import Agent
+from lpv_track_env.bicycle import STATE_SIZE
+from trajectories import ReferencePath
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What happened at the ends of n control periods, and (index 0) at the start: arrays (n + 1,).
+
+    `state` is (n + 1, 6): vx, vy, psi, r, X, Y. `acceleration` and `steering_angle` are the
+    actuators' values in force during the period that ends there. `solve_time` (s) is the agent's
+    whole `predict` call of that period, 0 at the start.
+    """
+
+    time: Array
+    state: Array
+    arc_length: Array
+    lateral_error: Array
+    heading_error: Array
+    reference_speed: Array
+    acceleration: Array
+    steering_angle: Array
+    solve_time: Array
+    reward: Array
+    clipped: Array
+
+    def as_dict(self) -> dict[str, Array]:
+        """Arrays by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A finished episode."""
+
+    trace: Trace
+    end: str
+    path: ReferencePath
+    control_period: float
+    statuses: dict[str, int]
+    """Solves by status, empty for agents that solve nothing."""
+    fallbacks: dict[str, int]
+    """Steps in which something replaced a failed solve, by its name."""
+    solver_seconds: Array
+    """Time inside the solver, (n,) s; empty for agents that solve nothing."""
+    iterations: Array
+    slack: Array
+    """Largest slack on (vx, vy, vx') over all plans, (3,)."""
+
+
+def rollout(
+    env: gymnasium.Env[Any, Any],
+    agent: Agent,
+    seed: int | None = None,
+    options: dict[str, Any] | None = None,
+    on_step: Callable[[int, dict[str, Any]], None] | None = None,
+) -> Rollout:
+    """Drive one episode from reset to its end.
+
+    `on_step(k, info)` is called after each step, with the agent's diagnostics under "agent".
+    """
+    observation, info = env.reset(seed=seed, options=options)
+    inner: Any = env.unwrapped
+    layout, period = inner.layout, inner.control_period
+    rows: list[list[float]] = []
+    states: list[Array] = []
+
+    def note(info: dict[str, Any], seconds: float, reward: float) -> None:
+        seen = layout.unpack(observation)
+        states.append(info["state"])
+        rows.append(
+            [
+                info["arc_length"],
+                info["lateral_error"],
+                info["heading_error"],
+                float(info["state"][0] - info["speed_error"]),
+                float(seen.acceleration),
+                float(seen.steering_angle),
+                seconds,
+                reward,
+                float(info["clipped"]),
+            ]
+        )
+
+    note(info, 0.0, 0.0)
+    memory: Any = None
+    start = np.array([True])
+    statuses: dict[str, int] = {}
+    fallbacks: dict[str, int] = {}
+    solver_seconds: list[float] = []
+    iterations: list[int] = []
+    slack = np.zeros(3)
+    explain = getattr(agent, "diagnostics", None)
+    done = False
+    while not done:
+        began = time.perf_counter()
+        action, memory = agent.predict(observation, memory, episode_start=start)
+        seconds = time.perf_counter() - began
+        start = np.array([False])
+        observation, reward, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        note(info, seconds, float(reward))
+        told = explain(memory[0]) if explain is not None else {}
+        if told:
+            statuses[told["status"]] = statuses.get(told["status"], 0) + 1
+            if told["fallback"]:
+                fallbacks[told["fallback"]] = fallbacks.get(told["fallback"], 0) + 1
+            solver_seconds.append(told["seconds"])
+            iterations.append(told["iterations"])
+            if told["slack"] is not None:
+                slack = np.maximum(slack, told["slack"])
+        if on_step is not None:
+            on_step(len(rows) - 1, {**info, "agent": told})
+    table = np.array(rows).T
+    trace = Trace(period * np.arange(len(rows)), np.array(states).reshape(-1, STATE_SIZE), *table)
+    return Rollout(
+        trace=trace,
+        end=str(info["end"]),
+        path=inner.path,
+        control_period=period,
+        statuses=statuses,
+        fallbacks=fallbacks,
+        solver_seconds=np.array(solver_seconds),
+        iterations=np.array(iterations, dtype=float),
+        slack=slack,
+    )

@@ -1,0 +1,78 @@
+"""Named lists of cases."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import agents
+from trajectories import PUBLISHED
+
+Spec = dict[str, Any]
+
+SIX = tuple(PUBLISHED)
+RAW = tuple(f"{name}-raw" for name in SIX)
+RAW_PREVIEW = {"preview_steps": 30, "preview_period": 0.1}
+
+
+def grid(
+    agent_names: Iterable[str],
+    trajectories: Iterable[str],
+    *,
+    vehicles: Iterable[str] = ("m2-minibus",),
+    speed_modes: Iterable[str] = ("variable",),
+    seeds: Iterable[int] = (0,),
+    **common: Any,
+) -> list[Spec]:
+    """Every combination, the slowest agents first so that a pool ends evenly."""
+    named = sorted(agent_names, key=lambda name: not name.startswith("lpv-nmpc"))
+    return [
+        {
+            "agent": agent,
+            "trajectory": trajectory,
+            "vehicle": vehicle,
+            "speed_mode": mode,
+            "seed": seed,
+            **common,
+        }
+        for agent in named
+        for vehicle in vehicles
+        for mode in speed_modes
+        for trajectory in trajectories
+        for seed in seeds
+    ]
+
+
+def quick(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
+    """A minute: every agent on T2 and a U-turn."""
+    return grid(agent_names, ("T2", "u-turn"), seeds=seeds)
+
+
+def paper(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
+    """The paper's six in both speed modes and as raw waypoints, and with the other vehicle.
+
+    On raw waypoints a corner must be seen 3 s ahead to be cut: agents get 30 preview steps of
+    0.1 s there.
+    """
+    return [
+        *grid(agent_names, SIX, seeds=seeds),
+        *grid(agent_names, RAW, seeds=seeds, env_settings=RAW_PREVIEW),
+        *grid(agent_names, SIX, speed_modes=("fixed",), seeds=seeds),
+        *grid(agent_names, SIX, vehicles=("course-car",), seeds=seeds),
+    ]
+
+
+def sideslip(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
+    """`course-car` with and without the limit |vy| <= 0.17 vx in its way (errata, 5)."""
+    solved = [name for name in agent_names if name.startswith("lpv-nmpc")]
+    car, wide = ("course-car",), {"max_lateral_velocity_ratio": 0.5}
+    return [
+        *grid(solved, SIX, vehicles=car, seeds=seeds),
+        *grid(solved, SIX, vehicles=car, seeds=seeds, vehicle_changes=wide),
+    ]
+
+
+SUITES = {"paper": paper, "quick": quick, "sideslip": sideslip}
+
+
+def default_agents() -> list[str]:
+    """Every agent that needs no more than this project's own packages."""
+    return agents.names()

@@ -1,0 +1,438 @@
+"""The paper's table from results: one source of rows, drawn for a terminal and for HTML.
+
+Cases are grouped by setting (vehicle, speed mode and whatever else of a case is not the default)
+and trajectory. A group's first row is the published one (kumar2025lpv, simulation), then one row
+per agent; several seeds become a mean and a 95 % interval of it by the t-distribution.
+"""
+
+import html
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+from scipy.stats import t as student
+
+import agents
+import trajectories
+from experiments import published
+from experiments.cases import Case
+
+Result = Mapping[str, Any]
+
+CONFIDENCE = 0.95
+KEPT = 1e-3
+"""A constraint broken by no more than this, in its own unit, counts as kept (as in `metrics`)."""
+UNITS = {
+    "speed": "m/s",
+    "lateral_velocity": "m/s",
+    "longitudinal_acceleration": "m/s²",
+    "steering_angle": "rad",
+    "steering_rate": "rad/s",
+    "jerk": "m/s³",
+}
+SYMBOLS = {
+    "speed": "vx range",
+    "lateral_velocity": "|vy|/vx",
+    "longitudinal_acceleration": "dvx/dt range",
+    "steering_angle": "|δ|",
+    "steering_rate": "|dδ/dt|",
+    "jerk": "|da/dt|",
+}
+PUBLISHED_LABEL = "published"
+PUBLISHED_DECIMALS = 2
+PUBLISHED_NOTE = (
+    "Published rows: kumar2025lpv, simulation. Its vehicle, weights and paths are not public, so "
+    "they stand beside ours for orientation."
+)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over runs, and the half width of its 95 % interval where there are several."""
+
+    mean: float
+    half_width: float | None = None
+
+
+@dataclass(frozen=True)
+class Column:
+    """A numeric column: key in `Row.values`, heading, unit, decimals, factor on what is stored."""
+
+    key: str
+    heading: str
+    unit: str
+    decimals: int
+    factor: float = 1.0
+    source: str = "metrics"
+
+    def text(self, row: "Row", separator: str = " ") -> str:
+        """Cell of a row: the mean, and ± half width after `separator`; published as printed."""
+        found = row.values.get(self.key)
+        if found is None:
+            return "–"
+        decimals = PUBLISHED_DECIMALS if row.published else self.decimals
+        mean = f"{self.factor * found.mean:.{decimals}f}"
+        if found.half_width is None:
+            return mean
+        return f"{mean}{separator}±{self.factor * found.half_width:.{decimals}f}"
+
+
+TRACKING = tuple(
+    Column(key, published.LABELS[key].rsplit(" ", 1)[0], published.LABELS[key].rsplit(" ", 1)[1], 3)
+    for key in published.COLUMNS
+)
+"""The paper's columns: in metres, and for the heading in radians."""
+EFFORT = (
+    Column("median", "predict median", "ms", 2, 1e3, "solver"),
+    Column("p99", "predict p99", "ms", 2, 1e3, "solver"),
+    Column("steering_variation", "steering variation", "rad", 2),
+    Column("acceleration_variation", "accel. variation", "m/s²", 1),
+)
+FURTHER = (
+    Column("mean_abs_lateral_error", "mean |e_d|", "m", 3),
+    Column("mean_time_indexed_distance", "mean by the clock", "m", 3),
+    Column("max_time_indexed_distance", "max by the clock", "m", 3),
+    Column("rms_speed_error", "rms speed error", "m/s", 3),
+    Column("max_speed_error", "max speed error", "m/s", 3),
+    Column("steering_rate_rms", "rms steering rate", "rad/s", 3),
+    Column("jerk_rms", "rms jerk", "m/s³", 3),
+    Column("duration", "duration", "s", 1),
+)
+"""What the paper's table leaves out; "by the clock" is the distance to where the reference is."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the tables: a published row or an agent's runs of one setting and trajectory."""
+
+    setting: str
+    trajectory: str
+    label: str
+    values: Mapping[str, Estimate] = field(default_factory=dict)
+    published: bool = False
+    end: str = ""
+    failures: str = ""
+    violations: str = ""
+    runs: int = 0
+
+
+def estimate(values: Sequence[float]) -> Estimate:
+    """Mean of one or more values; from two on with its interval, t_(0.975, n - 1) s / sqrt(n)."""
+    mean = float(np.mean(values))
+    n = len(values)
+    if n < 2:
+        return Estimate(mean)
+    quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, n - 1))
+    return Estimate(mean, quantile * float(np.std(values, ddof=1)) / n**0.5)
+
+
+def _changes(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key}={values[key]}" for key in sorted(values))
+
+
+def setting_of(case: Result) -> str:
+    """Words for all that two cases share if they may stand in one table: all but path and agent."""
+    parts = [str(case.get("vehicle", "?"))]
+    if changed := case.get("vehicle_changes"):
+        parts.append(f"with {_changes(changed)}")
+    speed = f"{case.get('speed_mode', '?')} speed"
+    if case.get("fixed_speed") is not None:
+        speed += f" {case['fixed_speed']} m/s"
+    parts.append(speed)
+    if case.get("conditions", "simulation") != "simulation":
+        parts.append(f"conditions {case['conditions']}")
+    if case.get("control_period", Case.control_period) != Case.control_period:
+        parts.append(f"control period {case['control_period']} s")
+    if changed := case.get("env_settings"):
+        parts.append(f"env {_changes(changed)}")
+    return " · ".join(parts)
+
+
+def label_of(case: Result) -> str:
+    """The agent and, where it has any, its settings."""
+    settings = case.get("agent_settings")
+    return f"{case.get('agent', '?')}" + (f" ({_changes(settings)})" if settings else "")
+
+
+def labels(cases: Iterable[Result]) -> list[str]:
+    """Labels of agents in the order of the registry, each once."""
+    rank = _rank(agents.names())
+    found = {label_of(case): str(case.get("agent")) for case in cases}
+    return sorted(found, key=lambda label: (rank(found[label]), label))
+
+
+def current(cases: Iterable[Result]) -> list[Result]:
+    """Cases without those that a later one repeats: same case, run from other sources.
+
+    A case's id changes with the project's sources, so a folder that was resumed after a change
+    holds both; averaged, they would pass for two seeds.
+    """
+    names = [item.name for item in fields(Case)]
+    latest = {repr([(name, case.get(name)) for name in names]): case for case in cases}
+    return list(latest.values())
+
+
+def _rank(known: Sequence[str]) -> Callable[[str], tuple[int, str]]:
+    places = {name: place for place, name in enumerate(known)}
+    return lambda name: (places.get(name, len(places)), name)
+
+
+def ordered(cases: Iterable[Result]) -> list[Result]:
+    """Cases by setting, trajectory, agent and seed, independent of the order they were run in."""
+    path, agent = _rank(trajectories.names()), _rank(agents.names())
+    listed = list(cases)
+    # The most common settings first: what the paper ran stands above the variations on it.
+    counts = Counter(setting_of(case) for case in listed)
+    return sorted(
+        listed,
+        key=lambda case: (
+            -counts[setting_of(case)],
+            setting_of(case),
+            path(str(case.get("trajectory"))),
+            agent(str(case.get("agent"))),
+            label_of(case),
+            case.get("seed", 0),
+        ),
+    )
+
+
+def violated(metrics: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    """Constraints that an episode broke: name -> (largest excess, share of control periods)."""
+    names = [key.removeprefix("excess_") for key in metrics if key.startswith("excess_")]
+    return {
+        name: (float(metrics[f"excess_{name}"]), float(metrics.get(f"violated_{name}", 0.0)))
+        for name in names
+        if metrics[f"excess_{name}"] > KEPT
+    }
+
+
+def _violation_words(episodes: Sequence[Mapping[str, float]]) -> str:
+    """Per constraint the largest excess over episodes and the mean share; "none" if all is kept."""
+    broken = [violated(metrics) for metrics in episodes]
+    words = []
+    for name in dict.fromkeys(name for one in broken for name in one):
+        excess = max(one[name][0] for one in broken if name in one)
+        share = sum(one[name][1] for one in broken if name in one) / len(broken)
+        percent = f"{100 * share:.1f}" if share >= 5e-4 else "<0.1"
+        words.append(
+            f"{SYMBOLS.get(name, name)}: {excess:.3g} {UNITS.get(name, '')}".rstrip()
+            + f", {percent} %"
+        )
+    return "; ".join(words) or "none"
+
+
+def _failure_words(cases: Sequence[Result]) -> str:
+    """Failed of all solves; "–" for agents that solve nothing."""
+    solves = sum(case["solver"].get("solves") or 0 for case in cases)
+    failures = sum(case["solver"].get("failures") or 0 for case in cases)
+    return f"{failures} of {solves}" if solves else "–"
+
+
+def _end_words(cases: Sequence[Result]) -> str:
+    """How episodes ended: the word alone if all did alike, counts otherwise."""
+    ends = Counter(
+        str(case.get("end") or "?").replace("_", " ") if case.get("status") == "ok" else "failed"
+        for case in cases
+    )
+    if len(ends) == 1 and len(cases) == 1:
+        return next(iter(ends))
+    return ", ".join(f"{count} {end}" for end, count in ends.items())
+
+
+def _agent_row(setting: str, trajectory: str, label: str, cases: Sequence[Result]) -> Row:
+    done = [case for case in cases if case.get("status") == "ok"]
+    values = {}
+    for column in (*TRACKING, *EFFORT, *FURTHER):
+        found = [case.get(column.source, {}).get(column.key) for case in done]
+        numbers = [float(value) for value in found if value is not None]
+        if numbers:
+            values[column.key] = estimate(numbers)
+    return Row(
+        setting=setting,
+        trajectory=trajectory,
+        label=label,
+        values=values,
+        end=_end_words(cases),
+        failures=_failure_words(done) if done else "–",
+        violations=_violation_words([case["metrics"] for case in done]) if done else "–",
+        runs=len(done),
+    )
+
+
+def build_rows(cases: Iterable[Result]) -> list[Row]:
+    """All rows in order: per setting and trajectory the published one, then the agents'."""
+    groups: dict[tuple[str, str], dict[str, list[Result]]] = {}
+    for case in ordered(current(cases)):
+        key = setting_of(case), str(case.get("trajectory"))
+        groups.setdefault(key, {}).setdefault(label_of(case), []).append(case)
+    rows = []
+    for (setting, trajectory), by_label in groups.items():
+        reference = published.row(trajectory)
+        if reference is not None:
+            values = {key: Estimate(value) for key, value in reference.items()}
+            rows.append(Row(setting, trajectory, PUBLISHED_LABEL, values, published=True))
+        rows += [_agent_row(setting, trajectory, label, group) for label, group in by_label.items()]
+    return rows
+
+
+def by_setting(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Rows by their setting, in order."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row.setting, []).append(row)
+    return groups
+
+
+def console_table(cases: Iterable[Result]) -> RenderableType:
+    """Two tables a setting for a terminal of 120 columns: tracking, and what it took."""
+    parts: list[RenderableType] = []
+    for setting, rows in by_setting(build_rows(cases)).items():
+        parts += [_console_tracking(setting, rows), _console_effort(rows), Text()]
+    return Group(*parts, Text(PUBLISHED_NOTE, style="dim"))
+
+
+def _console_start(title: str | None = None) -> Table:
+    table = Table(
+        title=Text(title) if title else None, title_justify="left", title_style="bold",
+        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False,
+    )  # fmt: skip
+    table.add_column("path", no_wrap=True, min_width=4, max_width=18, overflow="ellipsis")
+    table.add_column("agent", min_width=16, max_width=26, overflow="fold")
+    return table
+
+
+def _console_lines(
+    table: Table, rows: Sequence[Row], cells: Callable[[Row], Sequence[str]]
+) -> Table:
+    """Add rows; the trajectory is named once and its group closed by a blank line."""
+    seen = ""
+    for place, row in enumerate(rows):
+        last = place + 1 == len(rows) or rows[place + 1].trajectory != row.trajectory
+        name = "" if row.trajectory == seen else row.trajectory
+        seen = row.trajectory
+        table.add_row(
+            Text(name, style="bold"),
+            *(Text(cell) for cell in (row.label, *cells(row))),
+            style="italic dim" if row.published else "",
+            end_section=last,
+        )
+    return table
+
+
+def _console_tracking(setting: str, rows: Sequence[Row]) -> Table:
+    table = _console_start(setting)
+    for column in TRACKING:
+        table.add_column(f"{column.heading}\n{column.unit}", justify="right", no_wrap=True)
+    table.add_column("end", max_width=18)
+    return _console_lines(
+        table,
+        rows,
+        lambda row: [
+            *(column.text(row, "\n") for column in TRACKING),
+            row.end,
+        ],
+    )
+
+
+def _console_effort(rows: Sequence[Row]) -> Table:
+    table = _console_start()
+    for column in EFFORT:
+        heading = column.heading.replace(" ", "\n", 1)
+        table.add_column(f"{heading}\n{column.unit}", justify="right", no_wrap=True)
+    table.add_column("solves\nfailed", justify="right", max_width=11)
+    table.add_column("constraints broken: largest excess,\nshare of periods", ratio=1)
+    return _console_lines(
+        table,
+        [row for row in rows if not row.published],
+        lambda row: [
+            *(column.text(row, "\n") for column in EFFORT),
+            row.failures,
+            row.violations,
+        ],
+    )
+
+
+def html_table(
+    headings: Sequence[str], lines: Iterable[Sequence[str]], numeric: Iterable[int] = ()
+) -> str:
+    """A plain HTML table from text cells, all escaped; columns `numeric` are aligned right."""
+    right = set(numeric)
+
+    def cell(tag: str, place: int, text: str) -> str:
+        kind = ' class="n"' if place in right else ""
+        return f"<{tag}{kind}>{html.escape(text)}</{tag}>"
+
+    head = "".join(cell("th", place, text) for place, text in enumerate(headings))
+    body = "\n".join(
+        "<tr>" + "".join(cell("td", place, text) for place, text in enumerate(line)) + "</tr>"
+        for line in lines
+    )
+    return (
+        f'<div class="wide" tabindex="0"><table><thead><tr>{head}</tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def html_rows(
+    rows: Sequence[Row], columns: Sequence[Column], texts: Mapping[str, Callable[[Row], str]]
+) -> str:
+    """HTML table of one setting's rows: trajectory, agent, numeric columns, columns of text."""
+    heads = "".join(
+        f'<th class="n">{html.escape(column.heading)} '
+        f"<small>{html.escape(column.unit)}</small></th>"
+        for column in columns
+    ) + "".join(f"<th>{html.escape(heading)}</th>" for heading in texts)
+    lines = []
+    seen = ""
+    for row in rows:
+        first = row.trajectory != seen
+        seen = row.trajectory
+        classes = " ".join(
+            name for name, on in (("published", row.published), ("first", first)) if on
+        )
+        cells = "".join(
+            f'<td class="n">{html.escape(column.text(row))}</td>' for column in columns
+        ) + "".join(f'<td class="t">{html.escape(words(row))}</td>' for words in texts.values())
+        name = html.escape(row.trajectory) if first else ""
+        label = html.escape(row.label + (f" ×{row.runs}" if row.runs > 1 else ""))
+        lines.append(
+            f'<tr class="{classes}"><th scope="row">{name}</th><td class="who">{label}</td>'
+            f"{cells}</tr>"
+        )
+    body = "\n".join(lines)
+    return (
+        f'<div class="wide" tabindex="0"><table class="grouped"><thead><tr><th>path</th>'
+        f"<th>agent</th>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def html_tables(cases: Iterable[Result]) -> dict[str, str]:
+    """Per setting the tables of a report: tracking, what it took, and what the paper leaves out."""
+    result = {}
+    for setting, rows in by_setting(build_rows(cases)).items():
+        ours = [row for row in rows if not row.published]
+        result[setting] = "\n".join(
+            [
+                html_rows(rows, TRACKING, {"end": lambda row: row.end}),
+                "<h4>Effort and constraints</h4>",
+                html_rows(
+                    ours,
+                    EFFORT,
+                    {
+                        "solves failed": lambda row: row.failures,
+                        "constraints broken: largest excess, share of control periods": (
+                            lambda row: row.violations
+                        ),
+                    },
+                ),
+                "<h4>Beyond the paper's columns</h4>",
+                html_rows(ours, FURTHER, {}),
+            ]
+        )
+    return result
