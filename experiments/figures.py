@@ -159,12 +159,17 @@ def slim(svg: str) -> str:
     svg = svg[svg.index("<svg") :]
     head, rest = svg.split(">", 1)
     head = re.sub(r' (?:width|height)="[^"]*"', "", head)
-    svg = f'{head} font-family="DejaVu Sans, sans-serif" font-size="9">{rest}'
+    # Its style sheet would hold for the whole page, its font is said once for all texts.
+    rest = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", rest, count=1, flags=re.DOTALL)
+    rest = rest.replace("font-size: 9px; font-family: 'DejaVu Sans', sans-serif; ", "")
+    rest = re.sub(r' transform="rotate\(-0 [^)]*\)"', "", rest)
+    svg = (
+        f'{head} font-family="DejaVu Sans, sans-serif" font-size="9" stroke-linejoin="round">{rest}'
+    )
     used = set(re.findall(r'(?:url\(#|href="#)([^")]+)', svg))
     svg = re.sub(r'(<\w+) id="([^"]*)"', lambda m: m[0] if m[2] in used else m[1], svg)
     svg = re.sub(r' d="([^"]*)"', lambda m: f' d="{_shorten(m[1])}"', svg)
     svg = re.sub(r'( [xy])="(-?\d+\.\d+)"', lambda m: f'{m[1]}="{float(m[2]):.2f}"', svg)
-    svg = svg.replace("font: 9px 'DejaVu Sans', sans-serif; ", "")
     return re.sub(r"\n\s*", "\n", svg).strip()
 
 

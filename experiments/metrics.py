@@ -115,9 +115,11 @@ def violations(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) ->
     return result
 
 
-METRICS: tuple[
-    Callable[[Trace, ReferencePath, VehicleParameters], dict[str, float]], ...
-] = (tracking, activity, violations)
+METRICS: tuple[Callable[[Trace, ReferencePath, VehicleParameters], dict[str, float]], ...] = (
+    tracking,
+    activity,
+    violations,
+)
 """Every function's entries go into a case's `metrics`; add your own here."""
 
 

@@ -268,8 +268,8 @@ def summary(cases: Sequence[Result], superseded: int) -> str:
     if superseded:
         parts.append(
             paragraph(
-                f"{superseded} older results of the same cases, run from other sources, are in the "
-                "folder and left out."
+                f"Left out: {superseded} older result{'s' * (superseded > 1)} of cases that were "
+                "run again from other sources."
             )
         )
     for setting, group in _cases_by_setting(cases).items():

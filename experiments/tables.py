@@ -132,12 +132,27 @@ def estimate(values: Sequence[float]) -> Estimate:
     return Estimate(mean, quantile * float(np.std(values, ddof=1)) / n**0.5)
 
 
+def _raw(case: Result) -> bool:
+    return str(case.get("trajectory")).endswith("-raw")
+
+
+def _departures(case: Result) -> int:
+    """In how many respects a case's setting is not the default one."""
+    names = ("vehicle", "speed_mode", "fixed_speed", "conditions", "control_period")
+    changed = [case.get(name, getattr(Case, name)) != getattr(Case, name) for name in names]
+    extra = (_raw(case), case.get("vehicle_changes"), case.get("env_settings"))
+    return sum(map(bool, (*changed, *extra)))
+
+
 def _changes(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{key}={values[key]}" for key in sorted(values))
 
 
 def setting_of(case: Result) -> str:
-    """Words for all that two cases share if they may stand in one table: all but path and agent."""
+    """Words for all that two cases share if they may stand in one table: all but path and agent.
+
+    Raw waypoints are a setting: averaged with drivable paths they would tell nothing of either.
+    """
     parts = [str(case.get("vehicle", "?"))]
     if changed := case.get("vehicle_changes"):
         parts.append(f"with {_changes(changed)}")
@@ -145,6 +160,8 @@ def setting_of(case: Result) -> str:
     if case.get("fixed_speed") is not None:
         speed += f" {case['fixed_speed']} m/s"
     parts.append(speed)
+    if _raw(case):
+        parts.append("raw waypoints")
     if case.get("conditions", "simulation") != "simulation":
         parts.append(f"conditions {case['conditions']}")
     if case.get("control_period", Case.control_period) != Case.control_period:
@@ -186,13 +203,10 @@ def _rank(known: Sequence[str]) -> Callable[[str], tuple[int, str]]:
 def ordered(cases: Iterable[Result]) -> list[Result]:
     """Cases by setting, trajectory, agent and seed, independent of the order they were run in."""
     path, agent = _rank(trajectories.names()), _rank(agents.names())
-    listed = list(cases)
-    # The most common settings first: what the paper ran stands above the variations on it.
-    counts = Counter(setting_of(case) for case in listed)
     return sorted(
-        listed,
+        cases,
         key=lambda case: (
-            -counts[setting_of(case)],
+            _departures(case),
             setting_of(case),
             path(str(case.get("trajectory"))),
             agent(str(case.get("agent"))),

@@ -90,11 +90,13 @@ def test_both_engines_give_the_same_results() -> None:
     assert workers_left() == []
 
 
-@pytest.mark.parametrize("killers", [[2], [0, 5]])
-def test_a_case_that_kills_its_worker_is_reported_and_no_other_suffers(killers: list[int]) -> None:
-    cases = specs(7, killers=killers)
-    results = list(local_pool(cases, 2, run=kill_some))
-    assert seeds(results) == list(range(7))
+@pytest.mark.parametrize(("workers", "killers"), [(1, [0]), (2, [0, 4])])
+def test_a_case_that_kills_its_worker_is_reported_and_no_other_suffers(
+    workers: int, killers: list[int]
+) -> None:
+    cases = specs(3 * workers, killers=killers)
+    results = list(local_pool(cases, workers, run=kill_some))
+    assert seeds(results) == list(range(3 * workers))
     failed = [result for result in results if result["status"] != "ok"]
     assert seeds(failed) == killers
     for result in failed:

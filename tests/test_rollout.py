@@ -155,7 +155,7 @@ class Recorder(TrackingAgent):
     def new_memory(self):
         return {}
 
-    def control(self, observation, memory):
+    def control(self, _observation, _memory):
         return 0.2, 0.0
 
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
@@ -164,7 +164,7 @@ class Recorder(TrackingAgent):
 
 
 class Breaks(Recorder):
-    def control(self, observation, memory):
+    def control(self, _observation, _memory):
         if len(self.calls) == 5:
             raise ZeroDivisionError("in the fifth step")
         return 0.2, 0.0
@@ -201,7 +201,7 @@ def test_users_own_agents_run_and_their_exceptions_end_the_case_alone(own_agents
 
 def test_metrics_that_are_not_finite_fail_the_case(monkeypatch):
     """A line with NaN could not be written, and would end the sweep."""
-    broken = (*metrics.METRICS, lambda trace, path, car: {"mine": float("nan")})
+    broken = (*metrics.METRICS, lambda *_: {"mine": float("nan")})
     monkeypatch.setattr(metrics, "METRICS", broken)
     result = run_case(SHORT)
     assert result["status"] == "failed"
