@@ -37,7 +37,10 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7
 added."""
 DASHES = ("solid", "dashed", "dotted", "dashdot")
 REFERENCE = "#000000"
+BROAD: dict[str, Any] = {"color": REFERENCE, "alpha": 0.16, "linewidth": 6.0}
 LIMIT = "#B00020"
+ELONGATED = 0.08
+"""Width per length of a path under which equal scales would show a line."""
 AT_LIMIT = 0.99
 """Share of the limit on |vy|/vx from which on a vehicle is drawn as being at it."""
 EXCESS = 1e-3
@@ -113,7 +116,7 @@ def line_styles(labels: Iterable[str]) -> dict[str, LineStyle]:
     n, once = len(COLOURS), list(dict.fromkeys(labels))
     return {
         label: LineStyle(
-            COLOURS[k % n], DASHES[k // n % len(DASHES)], 1.9 - 1.1 * k / max(len(once) - 1, 1)
+            COLOURS[k % n], DASHES[k // n % len(DASHES)], 2.2 - 1.1 * k / max(len(once) - 1, 1)
         )
         for k, label in enumerate(once)
     }
@@ -257,11 +260,14 @@ def _draw_reference(axes: Axes, group: Sequence[Drive]) -> None:
         x = trace["state"][:, X] + trace["lateral_error"] * np.sin(heading)
         y = trace["state"][:, Y] - trace["lateral_error"] * np.cos(heading)
     kept = _spread(len(x))
-    axes.plot(x[kept], y[kept], color=REFERENCE, alpha=0.22, linewidth=4.5, solid_capstyle="round")
+    axes.plot(x[kept], y[kept], **BROAD, solid_capstyle="round")
     axes.plot(x[0], y[0], "o", color=REFERENCE, markersize=4.5)
-    axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("X (m)")
     axes.set_ylabel("Y (m)")
+    if min(np.ptp(x), np.ptp(y)) > ELONGATED * max(np.ptp(x), np.ptp(y)):
+        axes.set_aspect("equal", adjustable="datalim")
+    else:
+        axes.set_ylabel("Y (m), not to scale")
 
 
 def lateral_error(drives: Sequence[Drive], styles: Styles, salt: str) -> list[Panel]:
@@ -295,7 +301,7 @@ def speed(drives: Sequence[Drive], styles: Styles, salt: str) -> list[Panel]:
         kept = decimate(longest["reference_speed"])
         axes.plot(
             longest["arc_length"][kept], longest["reference_speed"][kept],
-            color=REFERENCE, alpha=0.22, linewidth=4.0,
+            **BROAD,
         )  # fmt: skip
         for drive in group:
             arc_length, vx = drive.trace["arc_length"], drive.trace["state"][:, VX]
@@ -330,7 +336,8 @@ def solve_times(drives: Sequence[Drive], styles: Styles, salt: str) -> list[Pane
     A thin line from the least to the greatest, a bar from the 5th to the 95th percentile, a tick at
     the median and a circle at the 99th percentile.
     """
-    labels = list(dict.fromkeys(drive.label for drive in drives))
+    shown = {drive.label for drive in drives}
+    labels = [label for label in styles if label in shown]
     calls = [
         np.concatenate([drive.trace["solve_time"][1:] for drive in drives if drive.label == label])
         for label in labels
@@ -427,7 +434,7 @@ def sideslip_limit(drives: Sequence[Drive], styles: Styles, salt: str) -> list[P
         needed = required_sideslip(group[0])
         if needed is not None:
             kept = decimate(needed[1])
-            share.plot(needed[0][kept], needed[1][kept], color=REFERENCE, alpha=0.22, linewidth=4.0)
+            share.plot(needed[0][kept], needed[1][kept], **BROAD)
             share.fill_between(
                 needed[0], 0.0, 1.0, where=needed[1] > limit, color=LIMIT, alpha=0.10,
                 linewidth=0.0, transform=share.get_xaxis_transform(),

@@ -145,6 +145,19 @@ def test_what_is_not_the_same_experiment_is_not_averaged():
     ]
 
 
+def test_the_default_setting_stands_first_and_raw_waypoints_apart():
+    results = [
+        case(1, vehicle="course-car"), case(2, trajectory="T2-raw"), case(3),
+        case(4, vehicle="course-car", speed_mode="fixed"),
+    ]  # fmt: skip
+    assert list(tables.by_setting(tables.build_rows(results))) == [
+        "m2-minibus · variable speed",
+        "course-car · variable speed",
+        "m2-minibus · variable speed · raw waypoints",
+        "course-car · fixed speed",
+    ]
+
+
 def test_a_case_run_again_from_other_sources_replaces_the_first():
     rows = tables.build_rows([case(1, metrics={"ale": 0.9}), case(2, metrics={"ale": 0.1})])
     assert rows[1].runs == 1
