@@ -110,7 +110,9 @@ def run(options: argparse.Namespace) -> int:
     """Run a parsed command; heavy modules load here, after one_thread."""
     from rich.console import Console
 
-    console = Console()
+    # Piped output keeps the tables' width; a terminal, or COLUMNS, has its own.
+    wide = None if sys.stdout.isatty() or "COLUMNS" in os.environ else 120
+    console = Console(width=wide)
     if options.command == "benchmark":
         return _benchmark(options, console)
     if options.command == "report":

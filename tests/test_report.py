@@ -9,7 +9,8 @@ import pytest
 from rich.console import Console
 
 from experiments import figures, published, tables
-from experiments.report import ERRATA, write_report
+from experiments.report import write_report
+from experiments.report_page import ERRATA
 from experiments.results import ResultStore
 from lpv_track_env import vehicle
 from trajectories import load
