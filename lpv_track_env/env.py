@@ -270,6 +270,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if end:
             info["end"] = kernels.END_NAMES[end]
             self._running = False
+        if self._renderer is not None:
+            self._renderer.follow(memory)
         if self.render_mode == "human":
             self.render()
         truncated = end == kernels.TIME_LIMIT

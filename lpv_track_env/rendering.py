@@ -170,10 +170,15 @@ class Renderer:
         if self._clock is not None:
             self._clock.tick(self.fps)
 
-    def _compose(self, memory: Array) -> None:
+    def follow(self, memory: Array) -> None:
+        """Note where the vehicle is for the trail, drawn or not in this step."""
         x, y = float(memory[X]), float(memory[Y])
         if not self._trail or math.dist(self._trail[-1], (x, y)) >= TRAIL_SPACING:
             self._trail.append((x, y))
+
+    def _compose(self, memory: Array) -> None:
+        x, y = float(memory[X]), float(memory[Y])
+        self.follow(memory)
         scale = SUPERSAMPLING * WIDTH / VIEW_WIDTH
         view = _View((x, y), scale, self._scene.get_size())
         self._scene.fill(BACKGROUND)

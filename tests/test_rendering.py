@@ -279,3 +279,21 @@ def test_no_video_driver_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RuntimeError, match=r"needs a display .*: use render_mode='rgb_array'$"):
         env.reset(seed=0)
     env.close()
+
+
+def test_trail_holds_the_steps_between_frames() -> None:
+    """A run that draws every tenth step shows the same trail as one that draws them all."""
+    frames = []
+    for every in (1, 10):
+        env = gymnasium.make(
+            "lpv_track_env/PathTracking-v0", trajectory="circle", render_mode="rgb_array"
+        )
+        env.reset(seed=0)
+        env.render()
+        for k in range(1, 41):
+            env.step(np.array([0.2, 0.12], dtype=np.float32))
+            if k % every == 0:
+                frame = env.render()
+        frames.append(frame)
+        env.close()
+    np.testing.assert_array_equal(frames[0], frames[1])
