@@ -2,8 +2,13 @@
 
 import difflib
 import importlib
+import importlib.util
 import inspect
+import sys
 from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -26,7 +31,7 @@ def names() -> list[str]:
 
 
 def agent_class(name: str) -> type[Any]:
-    """Class behind a name, or behind a "module:Class" of the user's own.
+    """Class behind a name, or behind a "module:Class" or "file.py:Class" of the user's own.
 
     Raises
     ------
@@ -34,18 +39,48 @@ def agent_class(name: str) -> type[Any]:
         For an unknown name; the message lists the known ones and the nearest.
     """
     target = REGISTRY.get(name, name)
-    module, separator, attribute = target.partition(":")
+    module, separator, attribute = target.rpartition(":")
     if not separator:
         nearest = difflib.get_close_matches(name, REGISTRY, n=1, cutoff=0.0)[0]
         raise ValueError(
             f"unknown agent {name!r}; known: {', '.join(REGISTRY)} (nearest: {nearest}), "
-            "or give your own as module:Class"
+            "or give your own as file.py:Class or module:Class"
         )
     try:
-        found: type[Any] = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+        if module.endswith(".py"):
+            found: type[Any] = getattr(_module_of(Path(module).resolve()), attribute)
+        else:
+            found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, OSError, SyntaxError) as error:
         raise ValueError(f"agent {name!r} cannot be loaded: {error}") from error
     return found
+
+
+@cache
+def _module_of(file: Path) -> ModuleType:
+    """A user's file as a module, loaded once a process."""
+    name = f"lpv_track_user_{file.stem}"
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{file.name} is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up there
+    spec.loader.exec_module(module)
+    return module
+
+
+def source_file(name: str) -> Path | None:
+    """File of a user's own agent, whose contents belong to a result; None for registered names."""
+    module, separator, _ = name.rpartition(":")
+    if name in REGISTRY or not separator:
+        return None
+    if module.endswith(".py"):
+        return Path(module)
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return None
+    return Path(spec.origin) if spec is not None and spec.origin is not None else None
 
 
 def check_settings(name: str, settings: Iterable[str]) -> None:

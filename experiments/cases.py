@@ -17,7 +17,7 @@ import numpy as np
 import agents
 import lpv_track_env
 import trajectories
-from agents.registry import check_settings
+from agents.registry import check_settings, source_file
 from experiments import metrics
 from experiments.rollout import Rollout, rollout
 from lpv_track_env import vehicle
@@ -62,8 +62,12 @@ class Case:
     @property
     def id(self) -> str:
         """Hash of the case, the files it names and the project's sources: none changes unseen."""
-        named = (Path(self.trajectory), Path(self.vehicle))
-        files = [hashlib.sha256(file.read_bytes()).hexdigest() for file in named if file.is_file()]
+        named = (Path(self.trajectory), Path(self.vehicle), source_file(self.agent))
+        files = [
+            hashlib.sha256(file.read_bytes()).hexdigest()
+            for file in named
+            if file is not None and file.is_file()
+        ]
         content = json.dumps([self.as_dict(), files, project_digest()], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 

@@ -39,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
     )
     benchmark.add_argument("--suite", default="paper", help="paper (default), quick or sideslip")
     benchmark.add_argument(
-        "--agents", nargs="+", metavar="NAME", help="default: all; or module:Class"
+        "--agents", nargs="+", metavar="NAME", help="default: all; your own: file.py:Class"
     )
     benchmark.add_argument(
         "--trajectories", nargs="+", metavar="NAME", help="instead of a suite's: names or files"

@@ -16,7 +16,7 @@ import lpv_track_env  # noqa: F401  registers the environments
 import trajectories
 from agents.base import TrackingAgent
 from agents.registry import check_settings
-from experiments.cases import run_case
+from experiments.cases import Case, run_case
 
 each_agent = pytest.mark.parametrize("name", agents.names())
 
@@ -256,7 +256,20 @@ def test_ones_own_class_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         agents.make(name, environment(), stearing=0.1)
 
 
-@pytest.mark.parametrize("name", ["no.such.module:Thing", "json:NoSuchClass"])
+def test_ones_own_file_drives_and_its_contents_belong_to_the_case(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(OWN_AGENT)
+    spec = {"agent": f"{file}:Steady", "trajectory": "straight"}
+    result = run_case(spec)
+    assert (result["status"], result["end"]) == ("ok", "finished")
+    assert result["id"] == Case(**spec).id
+    file.write_text(OWN_AGENT + "# changed\n")
+    assert result["id"] != Case(**spec).id
+
+
+@pytest.mark.parametrize(
+    "name", ["no.such.module:Thing", "json:NoSuchClass", "no_such_file.py:Thing"]
+)
 def test_a_class_that_cannot_be_loaded_is_named(name: str) -> None:
     with pytest.raises(ValueError, match=f"agent '{name}' cannot be loaded"):
         agents.make(name, environment())
