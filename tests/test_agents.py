@@ -17,6 +17,7 @@ import trajectories
 from agents.base import TrackingAgent
 from agents.registry import check_settings
 from experiments.cases import Case, run_case
+from lpv_track_env.registration import PATH_TRACKING
 
 each_agent = pytest.mark.parametrize("name", agents.names())
 
@@ -292,3 +293,21 @@ def test_stanley_loads_neither_casadi_nor_torch() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.stdout.strip() == "[]", done.stderr
+
+
+@pytest.mark.parametrize("name", ["stanley", "lpv-nmpc-ipopt"])
+def test_agents_pass_through_sb3s_evaluate_policy(name: str) -> None:
+    """Two environments at once, four episodes; perfect tracking returns 1 a second."""
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    venv = make_vec_env(PATH_TRACKING, n_envs=2, env_kwargs={"trajectory": "u-turn"})
+    env = gymnasium.make(PATH_TRACKING, trajectory="u-turn")
+    returns, lengths = evaluate_policy(
+        agents.make(name, env), venv, n_eval_episodes=4, return_episode_rewards=True
+    )
+    assert len(returns) == 4
+    assert len(set(returns)) == 1, "warm starts or memories leak from row to row"
+    duration = env.unwrapped.path.duration
+    assert 0.9 * duration < returns[0] <= duration
+    assert lengths[0] == pytest.approx(duration / 0.05, rel=0.02)

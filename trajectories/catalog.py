@@ -89,8 +89,8 @@ SHAPE_LIMITS = SpeedLimits(
 
 
 def names() -> list[str]:
-    """Names that `load` knows; `random-SEED` stands for any non-negative integer seed."""
-    return [*PUBLISHED, *(f"{name}-raw" for name in PUBLISHED), *ANALYTIC, "random-SEED"]
+    """Names that `load` knows, each of which loads; every random-SEED with an integer >= 0 does."""
+    return [*PUBLISHED, *(f"{name}-raw" for name in PUBLISHED), *ANALYTIC, "random-0"]
 
 
 def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
@@ -118,8 +118,8 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
         return read(Path(name))
     nearest = difflib.get_close_matches(name, names(), n=1, cutoff=0.0)[0]
     raise ValueError(
-        f"unknown trajectory {name!r}; known: {', '.join(names())} (nearest: {nearest}), "
-        "or give a .csv file"
+        f"unknown trajectory {name!r}; known: {', '.join(names())} and any other random-SEED "
+        f"(nearest: {nearest}), or give a .csv file"
     )
 
 
