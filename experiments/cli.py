@@ -206,25 +206,14 @@ def _trajectories(options: argparse.Namespace, console: object) -> int:
 
     import trajectories
     from experiments.suites import RAW, SIX
-    from experiments.trajectory_figures import ROWS, draw, rows_table
+    from experiments.trajectory_figures import draw, rows_table
 
     assert isinstance(console, Console)
     names = options.names or [*SIX, *RAW]
     paths = [trajectories.load(name) for name in names]
-    published = [name for name in names if name in (*SIX, *RAW)]
-    if published:
-        console.print(rows_table(published))
-    for name, path in zip(names, paths, strict=True):
-        if name in published:
-            continue
-        found = trajectories.statistics(path)
-        rows = [f"{words} {getattr(found, row):{form}} {unit}" for row, words, unit, form in ROWS]
-        console.print(
-            f"{path.name}: {', '.join(rows)}, duration {path.duration:.1f} s",
-            markup=False, highlight=False, soft_wrap=True,
-        )  # fmt: skip
+    console.print(rows_table(paths))
     if options.draw is not None:
-        draw(names if options.names else list(SIX), options.draw)
+        draw(paths if options.names else paths[: len(SIX)], options.draw)
         console.print(f"drawn: {options.draw}", markup=False, soft_wrap=True)
     if options.write is not None:
         from trajectories.files import write

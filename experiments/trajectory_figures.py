@@ -1,5 +1,6 @@
 """Published against achieved rows of trajectories, and a figure of their paths."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from trajectories import PUBLISHED, ReferencePath, load, statistics
+from experiments.results import write_atomically
+from trajectories import PUBLISHED, ReferencePath, statistics
 
 ROWS = (
     ("max_speed", "max speed", "m/s", ".2f"),
@@ -31,31 +33,33 @@ WHY_CURVATURE_DIFFERS = (
 COLOURS = "viridis"
 
 
-def rows_table(names: Sequence[str] = tuple(PUBLISHED)) -> Table:
-    """Table of each trajectory's published and achieved rows, names like "T1" or "T1-raw"."""
-    table = Table(title="Trajectories: published → achieved", caption=WHY_CURVATURE_DIFFERS)
-    table.add_column("row")
-    for name in names:
-        table.add_column(name, justify="right", no_wrap=True)
-    columns = [
-        (PUBLISHED[name.removesuffix("-raw")].rows, statistics(load(name))) for name in names
-    ]
-    for field, words, unit, form in ROWS:
-        cells = [
-            f"{getattr(published, field):{form}} → {getattr(achieved, field):{form}}"
-            for published, achieved in columns
-        ]
-        table.add_row(f"{words}, {unit}", *cells)
-    table.add_row("duration, s", *(f"{load(name).duration:.1f}" for name in names))
+def rows_table(paths: Sequence[ReferencePath]) -> Table:
+    """Table of each path's rows, the published ones above where there are any."""
+    known = any(path.name.removesuffix("-raw") in PUBLISHED for path in paths)
+    why = WHY_CURVATURE_DIFFERS if known else None
+    table = Table(title="Trajectories", caption=why, caption_justify="left")
+    table.add_column("path", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for _, words, unit, _ in ROWS:
+        table.add_column(f"{words} {unit}", justify="right")
+    table.add_column("duration s", justify="right")
+    for path in paths:
+        achieved = statistics(path)
+        cells = [f"{getattr(achieved, field):{form}}" for field, _, _, form in ROWS]
+        own = PUBLISHED.get(path.name.removesuffix("-raw"))
+        if own is not None:
+            rows = [f"{getattr(own.rows, field):{form}}" for field, _, _, form in ROWS]
+            table.add_row(path.name, "published", *rows, "")
+        first = "" if own is not None else path.name
+        table.add_row(first, "achieved", *cells, f"{path.duration:.1f}", end_section=True)
     return table
 
 
-def draw(names: Sequence[str], file: str | Path) -> None:
+def draw(paths: Sequence[ReferencePath], file: str | Path) -> None:
     """Draw paths coloured by speed, and curvature and speed over arc length.
 
     The file's suffix chooses the format (.png, .svg, .pdf).
     """
-    paths = [load(name) for name in names]
     colours = Normalize(0.0, max(float(path.speed.max()) for path in paths))
     figure = Figure(figsize=(12.0, 2.6 * len(paths)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -80,7 +84,9 @@ def draw(names: Sequence[str], file: str | Path) -> None:
     figure.colorbar(
         plans[0].collections[0], ax=plans, location="left", shrink=0.5, label="speed (m/s)"
     )
-    figure.savefig(Path(file), dpi=110)
+    file, buffer = Path(file), io.BytesIO()
+    figure.savefig(buffer, dpi=110, format=file.suffix.removeprefix(".") or "png")
+    write_atomically(file, buffer.getvalue())
 
 
 def _draw_plan(axes: Axes, path: ReferencePath, colours: Normalize) -> None:

@@ -401,7 +401,10 @@ def test_trajectories_are_drawn_and_written(
     picture, folder = tmp_path / "paths.png", tmp_path / "paths"
     command = ["trajectories", "u-turn", "--draw", str(picture), "--write", str(folder)]
     assert main(command) == 0
-    assert "u-turn: max speed" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    row = next(line for line in printed.splitlines() if "u-turn" in line)
+    assert [cell.strip() for cell in row.strip("│").split("│")][1:2] == ["achieved"]
+    assert "published" not in printed
     assert pygame.surfarray.array3d(pygame.image.load(picture)).std() > 5
     (file,) = folder.iterdir()
     path, original = trajectories.load(str(file)), trajectories.load("u-turn")
@@ -413,6 +416,15 @@ def test_trajectories_are_drawn_and_written(
 
 
 def test_the_published_rows_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["trajectories", "T2"]) == 0
-    assert "published" in capsys.readouterr().out
+    assert main(["trajectories", "T2", "T4-raw"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rows = [
+        [cell.strip() for cell in line.strip("│").split("│")]
+        for line in lines
+        if "published" in line or "achieved" in line
+    ]
+    assert rows[0] == ["T2", "published", "7.79", "2.01", "1.50", "513.2", "2.790", "24.49", ""]
+    assert rows[1][:6] == ["", "achieved", "7.79", "2.01", "1.50", "513.2"]
+    assert rows[1][6:8] == ["0.100", "24.49"]
+    assert rows[3][6:8] == rows[2][6:8] == ["4.000", "44.00"]
     assert "nearest: T2" in refused(capsys, "trajectories", "T22")
