@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import math
-import os
-import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trajectories import CurvatureBands, ReferencePath
+from trajectories.atomic import write_atomically
 
 Array = NDArray[np.float64]
 
@@ -137,17 +136,7 @@ class WeightSchedule:
             "blend": self.blend,
             "provenance": dict(self.provenance),
         }
-        text = json.dumps(content, indent=2)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        temporary = file.with_name(f".{file.name}.{secrets.token_hex(4)}.tmp")
-        try:
-            with temporary.open("w", encoding="utf-8") as handle:
-                handle.write(text)
-                handle.flush()
-                os.fsync(handle.fileno())
-            temporary.replace(file)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_atomically(Path(file), json.dumps(content, indent=2).encode())
 
     @classmethod
     def read(cls, file: Path) -> "WeightSchedule":

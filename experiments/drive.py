@@ -81,7 +81,7 @@ def save(frame: NDArray[np.uint8], file: Path) -> None:
 
     import pygame
 
-    from experiments.results import write_atomically
+    from trajectories.atomic import write_atomically
 
     surface = pygame.surfarray.make_surface(frame.swapaxes(0, 1))
     buffer = io.BytesIO()

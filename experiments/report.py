@@ -11,7 +11,8 @@ import numpy as np
 from experiments import figures, published, tables
 from experiments.figures import Drive, Panel, Styles
 from experiments.report_page import ERRATA, PAGE
-from experiments.results import ResultStore, write_atomically
+from experiments.results import ResultStore
+from trajectories.atomic import write_atomically
 
 Result = Mapping[str, Any]
 

@@ -22,24 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trajectories.atomic import write_atomically
+
 PACKAGES = ("lpv-track-env", "numpy", "scipy", "numba", "casadi", "gymnasium")
 OPTIONAL_PACKAGES = ("torch", "stable-baselines3", "highway-env")
 
 Array = NDArray[np.float64]
-
-
-def write_atomically(file: Path, content: bytes) -> None:
-    """Replace a file as a whole: temporary file in the same folder, fsync, rename."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as handle:
-            handle.write(content)
-            handle.flush()
-            os.fsync(handle.fileno())
-        temporary.replace(file)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 class ResultStore:

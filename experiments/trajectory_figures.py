@@ -12,8 +12,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from experiments.results import write_atomically
 from trajectories import PUBLISHED, ReferencePath, statistics
+from trajectories.atomic import write_atomically
 
 ROWS = (
     ("max_speed", "max speed", "m/s", ".2f"),

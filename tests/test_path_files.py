@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from trajectories import ReferencePath, SpeedLimits, load, statistics
 from trajectories.files import read, read_gps, read_native, read_racetrack, read_xy, write
-from trajectories.importers import earth_centred, east_north_up
+from trajectories.geodesy import earth_centred, east_north_up
 
 TRACKS = Path(__file__).parents[2] / "shared/tracks"
 ARRAYS = (

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from experiments import results
-from experiments.results import ResultStore, write_atomically
+from experiments.results import ResultStore
+from trajectories.atomic import write_atomically
 
 
 def result(name, **more):

@@ -6,9 +6,7 @@ are written so that reading them gives the same bits.
 """
 
 import json
-import os
 import re
-import secrets
 import warnings
 from dataclasses import asdict
 from pathlib import Path
@@ -17,16 +15,10 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from trajectories.atomic import write_atomically
+from trajectories.columns import COLUMNS, Table, read_table, read_text
 from trajectories.curvature import circle_curvature, signed_waypoint_curvature, statistics
-from trajectories.importers import (
-    COLUMNS,
-    Table,
-    read_gps,
-    read_racetrack,
-    read_table,
-    read_text,
-    read_xy,
-)
+from trajectories.importers import read_gps, read_racetrack, read_xy
 from trajectories.path import ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
 
@@ -85,18 +77,10 @@ def _plain(value: object) -> object:
 
 
 def _replace(file: Path, text: str) -> None:
-    """Write text to a temporary file beside `file`, flush it to the disk, and rename it."""
-    temporary = file.with_name(f".{file.name}.{secrets.token_hex(4)}.tmp")
     try:
-        with temporary.open("w", encoding="utf-8", newline="\n") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.replace(file)
+        write_atomically(file, text.encode())
     except OSError as error:
         raise OSError(error.errno, f"cannot write the path: {error.strerror}", str(file)) from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read(file: str | Path) -> ReferencePath:

@@ -9,13 +9,15 @@ import warnings
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from trajectories.catalog import from_geometry
+from trajectories.columns import COLUMNS, Table, is_number, read_table
+from trajectories.geodesy import east_north_up
 from trajectories.path import MINIMUM_POINTS, SPACING, ReferencePath
 from trajectories.shapes import Geometry
 from trajectories.smoothing import smooth
@@ -38,110 +40,6 @@ APPROACH, APPROACH_ALONG = 2.5, 20.0
 MINIMUM_LENGTH, MAXIMUM_LENGTH = 1.0, 30_000.0
 LARGEST_COORDINATE = 1e7
 """All in m but the factor; a coordinate beyond the last is not on Earth's map."""
-
-EQUATOR, FLATTENING = 6_378_137.0, 1.0 / 298.257223563
-"""WGS-84 ellipsoid: semi-major axis, m, and flattening."""
-
-COLUMNS = {
-    "x": ("x", "x_m", "east", "east_m", "easting", "easting_m"),
-    "y": ("y", "y_m", "north", "north_m", "northing", "northing_m"),
-    "latitude": ("lat", "latitude", "lat_deg", "latitude_deg"),
-    "longitude": ("lon", "lng", "long", "longitude", "lon_deg", "longitude_deg"),
-    "height": ("h", "h_m", "height", "height_m", "alt", "alt_m", "altitude", "altitude_m", "ele"),
-    "time": ("t", "t_s", "time", "time_s", "timestamp"),
-    "width": ("w_tr_right_m", "w_tr_left_m"),
-}
-
-
-@dataclass(frozen=True)
-class Table:
-    """Cells of a separated text file: header (lower case, may be empty), rows and their lines."""
-
-    file: Path
-    header: tuple[str, ...]
-    rows: list[list[str]]
-    lines: list[int]
-
-    def fail(self, message: str) -> NoReturn:
-        """Raise a ValueError that names the file."""
-        raise ValueError(f"{self.file}: {message}")
-
-    def find(self, quantity: str) -> int | None:
-        """Index of a quantity's column by its known names."""
-        for name in COLUMNS[quantity]:
-            if name in self.header:
-                return self.header.index(name)
-        return None
-
-    def column(self, index: int) -> Array:
-        """One column's numbers, (n,), finite."""
-        name = self.header[index] if self.header else str(index + 1)
-        values = np.empty(len(self.rows))
-        for k, (row, line) in enumerate(zip(self.rows, self.lines, strict=True)):
-            try:
-                values[k] = float(row[index])
-            except ValueError:
-                self.fail(f"line {line}, column {name}: {row[index][:40]!r} is not a number")
-            if not math.isfinite(values[k]):
-                self.fail(f"line {line}, column {name}: {row[index][:40]!r} is not finite")
-        return values
-
-
-def read_text(file: str | Path) -> str:
-    """Text of a file; every failure to read it is a ValueError of one line."""
-    try:
-        return Path(file).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise ValueError(f"{file}: cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{file}: is not a text file (byte {error.start})") from error
-
-
-def read_table(file: str | Path) -> Table:
-    """Split a text file at `,` or `;`; a header may be a `#` comment or a line without numbers.
-
-    Raises
-    ------
-    ValueError
-        For a file that cannot be read, has no rows, or a row of another number of cells.
-    """
-    comments: list[tuple[str, ...]] = []
-    header: tuple[str, ...] = ()
-    rows: list[list[str]] = []
-    lines: list[int] = []
-    for number, line in enumerate(read_text(file).split("\n"), start=1):
-        text = line.strip()
-        cells = [cell.strip() for cell in text.lstrip("#").split(";" if ";" in text else ",")]
-        if not text:
-            continue
-        if text.startswith("#"):
-            if not rows:
-                comments.append(tuple(cell.strip('" ').lower() for cell in cells))
-        elif not rows and not header and not any(map(_is_number, cells)):
-            header = tuple(cell.strip('" ').lower() for cell in cells)
-        else:
-            rows.append(cells)
-            lines.append(number)
-    table = Table(Path(file), header, rows, lines)
-    if not rows:
-        table.fail("has no rows of numbers")
-    width = len(header or rows[0])
-    for row, number in zip(rows, lines, strict=True):
-        if len(row) != width:
-            table.fail(f"line {number} has {len(row)} columns, not {width}: torn or not a table")
-    if not header:
-        known = {name for group in COLUMNS.values() for name in group}
-        fitting = [c for c in comments if len(c) == width and len(known.intersection(c)) >= 2]
-        table = Table(table.file, fitting[-1] if fitting else (), rows, lines)
-    return table
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def read_racetrack(
@@ -293,7 +191,7 @@ def read_gps(
 
 def _times(table: Table, index: int) -> Array:
     """Seconds (n,) from a column of numbers or ISO 8601 stamps."""
-    if _is_number(table.rows[0][index]):
+    if is_number(table.rows[0][index]):
         return table.column(index)
     stamps = np.empty(len(table.rows))
     for k, row in enumerate(table.rows):
@@ -302,33 +200,6 @@ def _times(table: Table, index: int) -> Array:
         except (ValueError, OverflowError, OSError):
             table.fail(f"line {table.lines[k]}: {row[index][:40]!r} is not a time")
     return stamps
-
-
-def earth_centred(latitude: Array, longitude: Array, height: Array) -> Array:
-    """Earth-centred coordinates (n, 3), m, of WGS-84 latitude, longitude (deg) and height (m)."""
-    phi, lam = np.radians(latitude), np.radians(longitude)
-    square = FLATTENING * (2.0 - FLATTENING)  # e^2
-    normal = EQUATOR / np.sqrt(1.0 - square * np.sin(phi) ** 2)  # N(phi)
-    return np.column_stack(
-        [
-            (normal + height) * np.cos(phi) * np.cos(lam),
-            (normal + height) * np.cos(phi) * np.sin(lam),
-            ((1.0 - square) * normal + height) * np.sin(phi),
-        ]
-    )
-
-
-def east_north_up(
-    latitude: Array, longitude: Array, height: Array, origin: tuple[float, float, float]
-) -> Array:
-    """Coordinates (n, 3), m, in the plane that touches the ellipsoid at an origin (deg, deg, m)."""
-    offset = earth_centred(latitude, longitude, height)
-    offset = offset - earth_centred(*(np.array([value]) for value in origin))
-    phi, lam = math.radians(origin[0]), math.radians(origin[1])
-    sp, cp, sl, cl = math.sin(phi), math.cos(phi), math.sin(lam), math.cos(lam)
-    axes = np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
-    turned: Array = offset @ axes.T
-    return turned
 
 
 @dataclass
