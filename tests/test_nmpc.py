@@ -359,3 +359,13 @@ def test_rollout_on_t2_is_as_good_as_promised() -> None:
         M2_MINIBUS.wheelbase + M2_MINIBUS.understeer_gradient * path.speed**2
     ) * path.curvature
     assert metrics["steering_variation"] < 2.0 * np.abs(np.diff(steering)).sum()
+
+
+def test_a_solve_past_its_time_limit_says_so() -> None:
+    problem = NmpcProblem(M2_MINIBUS, horizon=5)
+    state, last, reference = random_situation(np.random.default_rng(6), problem)
+    hurried = CasadiSolver(problem, tolerance=1e-9, max_seconds=1e-6)
+    solution, _ = hurried.solve(state, last, reference, WEIGHTS)
+    assert solution.status is Status.TIMEOUT
+    unhurried = CasadiSolver(problem, tolerance=1e-9)
+    assert unhurried.solve(state, last, reference, WEIGHTS)[0].status is Status.SUCCESS

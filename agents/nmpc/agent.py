@@ -58,7 +58,9 @@ class IpoptNmpc(TrackingAgent[NmpcMemory]):
     linear_penalty, quadratic_penalty
         Prices of slack on (vx, vy, vx'), see `NmpcProblem`.
     tolerance, max_seconds
-        IPOPT's tolerance and the limit on one solve, s.
+        IPOPT's tolerance and the limit on one solve, s. The default is far above any solve, which
+        100 iterations bound: results must not depend on how busy the machine is. Lower it to
+        drive by the clock.
     max_failures
         Failed solves in a row after which the vehicle is brought to a stop.
 
@@ -83,7 +85,7 @@ class IpoptNmpc(TrackingAgent[NmpcMemory]):
         linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),
         quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0),
         tolerance: float = 1e-6,
-        max_seconds: float = 1.0,
+        max_seconds: float = 20.0,
         max_failures: int = 10,
     ) -> None:
         super().__init__(task)

@@ -83,7 +83,7 @@ class CasadiSolver:
     """
 
     def __init__(
-        self, problem: NmpcProblem, *, tolerance: float = 1e-6, max_seconds: float = 1.0
+        self, problem: NmpcProblem, *, tolerance: float = 1e-6, max_seconds: float = 20.0
     ) -> None:
         self.problem = problem
         n = problem.horizon
