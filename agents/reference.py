@@ -7,15 +7,20 @@ this frame the vehicle stands at (0, lateral_error) with heading heading_error.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.vehicle import VehicleParameters
+from trajectories.compilation import compiled
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
+
+NODE_SPEED, NODE_HEADING, NODE_X, NODE_Y, NODE_ARC_LENGTH = range(5)
+"""Columns of a node in compiled code: first the NMPC's outputs, in their order."""
+NODE = 5
 
 
 class LocalReference(NamedTuple):
@@ -74,27 +79,56 @@ def local_reference(observation: TrackingObservation, period: float) -> LocalRef
         of its end speeds times the period, and constant curvature, so it is an arc: its chord is
         length sinc(turn / 2), along its mean heading. Exact for a path of such intervals.
     """
-    speed = np.concatenate(
-        [observation.reference_speed[..., np.newaxis], observation.preview_speed], axis=-1
-    )
-    length = 0.5 * (speed[..., :-1] + speed[..., 1:]) * period
-    turn = observation.preview_curvature * length
-    heading = _accumulate(turn)
-    # np.sinc(z) is sin(pi z) / (pi z), and 1 at z = 0.
-    chord = length * np.sinc(turn / (2.0 * np.pi))
-    direction = heading[..., :-1] + 0.5 * turn
+    curvature = np.asarray(observation.preview_curvature, dtype=np.float64)
+    rows = curvature.reshape(-1, curvature.shape[-1])
+    first = np.asarray(observation.reference_speed, dtype=np.float64).reshape(-1)
+    speed = np.asarray(observation.preview_speed, dtype=np.float64).reshape(rows.shape)
+    nodes = np.empty((rows.shape[0], rows.shape[1] + 1, NODE))
+    _fill_rows(rows, first, speed, period, nodes)
+    shaped = nodes.reshape(*curvature.shape[:-1], rows.shape[1] + 1, NODE)
     return LocalReference(
-        arc_length=_accumulate(length),
-        x=_accumulate(chord * np.cos(direction)),
-        y=_accumulate(chord * np.sin(direction)),
-        heading=heading,
-        speed=speed,
+        arc_length=shaped[..., NODE_ARC_LENGTH],
+        x=shaped[..., NODE_X],
+        y=shaped[..., NODE_Y],
+        heading=shaped[..., NODE_HEADING],
+        speed=shaped[..., NODE_SPEED],
     )
 
 
-def _accumulate(steps: Array) -> Array:
-    """Sum steps (..., K) from 0 on, shape (..., K + 1)."""
-    return np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
+@compiled
+def fill_nodes(
+    curvature: Array, first_speed: Any, speed: Array, period: Any, nodes: Array
+) -> None:
+    """Fill nodes (n + 1, NODE) from the first n intervals of one preview."""
+    s = x = y = heading = 0.0
+    before = first_speed
+    # Direction of the path at the node before; turned twice by half an interval's angle.
+    c, d = 1.0, 0.0
+    nodes[0, NODE_SPEED], nodes[0, NODE_HEADING], nodes[0, NODE_X] = first_speed, 0.0, 0.0
+    nodes[0, NODE_Y], nodes[0, NODE_ARC_LENGTH] = 0.0, 0.0
+    for k in range(nodes.shape[0] - 1):
+        after = float(speed[k])
+        length = 0.5 * (before + after) * period
+        half = 0.5 * curvature[k] * length
+        ch, sh = math.cos(half), math.sin(half)
+        chord = length if abs(half) < 1e-9 else length * sh / half
+        c, d = c * ch - d * sh, d * ch + c * sh
+        s += length
+        x += chord * c
+        y += chord * d
+        heading += 2.0 * half
+        c, d = c * ch - d * sh, d * ch + c * sh
+        before = after
+        nodes[k + 1, NODE_SPEED], nodes[k + 1, NODE_HEADING] = after, heading
+        nodes[k + 1, NODE_X], nodes[k + 1, NODE_Y], nodes[k + 1, NODE_ARC_LENGTH] = x, y, s
+
+
+@compiled
+def _fill_rows(
+    curvature: Array, first_speed: Array, speed: Array, period: Any, nodes: Array
+) -> None:
+    for row in range(nodes.shape[0]):
+        fill_nodes(curvature[row], first_speed[row], speed[row], period, nodes[row])
 
 
 def point_at(

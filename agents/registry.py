@@ -16,6 +16,7 @@ import gymnasium
 from agents.base import Agent, DrivingTask
 
 REGISTRY: dict[str, str] = {
+    "lpv-nmpc": "agents.nmpc.rti_agent:RtiNmpc",
     "lpv-nmpc-ipopt": "agents.nmpc.agent:IpoptNmpc",
     "stanley": "agents.geometric:Stanley",
     "pure-pursuit": "agents.geometric:PurePursuit",

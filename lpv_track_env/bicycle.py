@@ -72,13 +72,68 @@ def field(
     force_front = caf * (delta * direction - (vy + lf * r) * q)
     force_rear = car * ((lr * r - vy) * q)
     lateral_front = force_front * cos_delta
+    # Divisions are slow: these two leave a compiled loop.
+    per_mass, per_inertia = 1.0 / mass, 1.0 / yaw_inertia
     return (
-        a - rolling_deceleration * direction - force_front * sin_delta / mass + r * vy,
-        (force_rear + lateral_front) / mass - r * vx,
+        a - rolling_deceleration * direction - force_front * sin_delta * per_mass + r * vy,
+        (force_rear + lateral_front) * per_mass - r * vx,
         r,
-        (lateral_front * lf - force_rear * lr) / yaw_inertia,
+        (lateral_front * lf - force_rear * lr) * per_inertia,
         vx * cos_psi - vy * sin_psi,
         vx * sin_psi + vy * cos_psi,
+    )
+
+
+def inverse_speed_slope_polynomial(ratio: Any, bounded_speed: Any, vx: Any) -> Any:
+    """Derivative dq/dvx of `inverse_speed_polynomial`, with the same arguments, for any backend."""
+    return (
+        vx * (12.0 * ratio * ratio - 20.0) / (8.0 * bounded_speed * bounded_speed * bounded_speed)
+    )
+
+
+def jacobian(
+    vx: Any,
+    vy: Any,
+    r: Any,
+    delta: Any,
+    cos_delta: Any,
+    sin_delta: Any,
+    q: Any,
+    slope: Any,
+    mass: Any,
+    yaw_inertia: Any,
+    lf: Any,
+    lr: Any,
+    caf: Any,
+    car: Any,
+    rolling_deceleration: Any,
+) -> tuple[Any, Any, Any, Any, Any, Any, Any, Any, Any, Any, Any, Any]:
+    """Partial derivatives of `field`'s (vx', vy', r') with respect to (vx, vy, r, delta).
+
+    Row by row: the four of vx', of vy', of r'. `slope` is dq/dvx. The other derivatives are plain:
+    dvx'/da = 1, and (X', Y') turn with psi.
+    """
+    direction, direction_slope = vx * q, q + vx * slope
+    front = caf * (delta * direction - (vy + lf * r) * q)
+    front_vx = caf * (delta * direction_slope - (vy + lf * r) * slope)
+    front_vy, front_r, front_delta = -caf * q, -caf * lf * q, caf * direction
+    rear_vx, rear_vy, rear_r = car * (lr * r - vy) * slope, -car * q, car * lr * q
+    per_mass, per_inertia = 1.0 / mass, 1.0 / yaw_inertia
+    across, along = cos_delta * per_mass, sin_delta * per_mass
+    turning, rear_turning = cos_delta * lf * per_inertia, lr * per_inertia
+    return (
+        -rolling_deceleration * direction_slope - front_vx * along,
+        r - front_vy * along,
+        vy - front_r * along,
+        -front_delta * along - front * across,
+        rear_vx * per_mass + front_vx * across - r,
+        rear_vy * per_mass + front_vy * across,
+        rear_r * per_mass + front_r * across - vx,
+        front_delta * across - front * along,
+        front_vx * turning - rear_vx * rear_turning,
+        front_vy * turning - rear_vy * rear_turning,
+        front_r * turning - rear_r * rear_turning,
+        (front_delta * cos_delta - front * sin_delta) * lf * per_inertia,
     )
 
 
@@ -195,7 +250,9 @@ def fastest_pole(vx: float, parameters: VehicleParameters) -> float:
 
 
 compiled_field = compiled(field)
+compiled_jacobian = compiled(jacobian)
 compiled_inverse_speed_polynomial = compiled(inverse_speed_polynomial)
+compiled_inverse_speed_slope_polynomial = compiled(inverse_speed_slope_polynomial)
 
 
 @compiled
@@ -204,5 +261,15 @@ def compiled_inverse_speed(vx: float) -> float:
     speed = abs(vx)
     value: float = compiled_inverse_speed_polynomial(
         min(speed / LOW_SPEED, 1.0), max(speed, LOW_SPEED)
+    )
+    return value
+
+
+@compiled
+def compiled_inverse_speed_slope(vx: float) -> float:
+    """dq/dvx inside compiled kernels."""
+    speed = abs(vx)
+    value: float = compiled_inverse_speed_slope_polynomial(
+        min(speed / LOW_SPEED, 1.0), max(speed, LOW_SPEED), vx
     )
     return value

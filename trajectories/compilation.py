@@ -37,6 +37,13 @@ def _warn_of_no_cache() -> None:
     )
 
 
+def _package(folder: Path) -> Path:
+    """Topmost package that a folder is in, or the folder itself."""
+    while (folder.parent / "__init__.py").is_file():
+        folder = folder.parent
+    return folder
+
+
 def compiled(function: Function) -> Function:
     """`numba.njit` with IEEE arithmetic, an on-disk cache, and division by zero giving inf.
 
@@ -49,7 +56,7 @@ def compiled(function: Function) -> Function:
         _warn_of_no_cache()
         return numba.njit(**options)(function)  # type: ignore[no-any-return]
     here = Path(__file__).parent
-    own = Path(function.__code__.co_filename).parent
+    own = _package(Path(function.__code__.co_filename).parent)
     index = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if index is not None and hasattr(index, "_source_stamp"):
         folders = dict.fromkeys((here, here.parent / "lpv_track_env", own))

@@ -1,17 +1,15 @@
-"""The LPV-NMPC as an agent: observation to problem, weights, warm start, what to do on failure."""
+"""The LPV-NMPC as an agent, solved to convergence: the reference for what is fast."""
 
-from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from agents.base import DrivingTask, TrackingAgent
-from agents.geometric import Stanley
+from agents.base import DrivingTask
+from agents.nmpc.base import Ladder, NmpcAgent
 from agents.nmpc.casadi_solver import CasadiSolver, WarmStart
-from agents.nmpc.problem import NmpcProblem, Solution, Status
-from agents.reference import local_reference
+from agents.nmpc.problem import Solution, Status
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.vehicle import VehicleParameters
@@ -23,6 +21,7 @@ Array = NDArray[np.float64]
 class NmpcMemory:
     """What the NMPC remembers of one vehicle."""
 
+    ladder: Ladder
     warm: WarmStart | None = None
     plan: Array | None = None
     """Inputs (N, 2) of the last plan that was solved."""
@@ -32,14 +31,9 @@ class NmpcMemory:
     """Failed solves in a row."""
     band: int | None = None
     solution: Solution | None = None
-    fallback: str = ""
-    """What replaced a failed solve in the last step: "", "plan", "stanley" or "stop"."""
-    counts: Counter[str] = field(default_factory=Counter)
-    """Failed solves by status, and fallbacks by name, in this episode."""
-    fallback_memory: Any = None
 
 
-class IpoptNmpc(TrackingAgent[NmpcMemory]):
+class IpoptNmpc(NmpcAgent[NmpcMemory]):
     """The LPV-NMPC of kumar2025lpv, solved to convergence by IPOPT through CasADi.
 
     Parameters
@@ -88,59 +82,21 @@ class IpoptNmpc(TrackingAgent[NmpcMemory]):
         max_seconds: float = 20.0,
         max_failures: int = 10,
     ) -> None:
-        super().__init__(task)
-        steps = task.layout.preview_steps
-        horizon = steps if horizon is None else horizon
-        if horizon > steps:
-            raise ValueError(
-                f"horizon {horizon} is longer than the preview of {steps} steps: "
-                f"make the environment with preview_steps={horizon}"
-            )
-        if selection not in {"band", "path"}:
-            raise ValueError(f"selection must be 'band' or 'path', not {selection!r}")
-        self.problem = NmpcProblem(
-            vehicle=model or task.vehicle,
+        super().__init__(
+            task,
             horizon=horizon,
-            period=task.layout.preview_period,
-            first_period=task.control_period,
+            weights=weights,
+            selection=selection,
+            model=model,
             linear_penalty=linear_penalty,
             quadratic_penalty=quadratic_penalty,
+            max_failures=max_failures,
         )
         self.solver = CasadiSolver(self.problem, tolerance=tolerance, max_seconds=max_seconds)
-        self.max_failures = max_failures
-        self._fallback = Stanley(task)
-        self._schedule: WeightSchedule | None = None
-        self._weights = TrackingWeights().as_array()
-        self.rejected_weights = 0
-        if isinstance(weights, WeightSchedule):
-            if selection == "path":
-                self.set_weights(weights.for_path(task.path).as_array())
-            else:
-                self._schedule = weights
-        elif weights is not None:
-            self.set_weights(weights.as_array())
 
     def new_memory(self) -> NmpcMemory:
         """Nothing solved yet."""
-        return NmpcMemory(fallback_memory=self._fallback.new_memory())
-
-    def set_weights(self, weights: TrackingWeights | ArrayLike) -> bool:
-        """Take new weights, (10,) as Q, S, R, from the next step on; the warm start is kept.
-
-        Values out of bounds are clipped to them; a vector that is not finite, negative or of the
-        wrong size is refused: the weights stay, `rejected_weights` counts it, False is returned.
-        """
-        try:
-            values = (
-                weights
-                if isinstance(weights, TrackingWeights)
-                else TrackingWeights.from_array(weights)
-            )
-        except (ValueError, TypeError):
-            self.rejected_weights += 1
-            return False
-        self._weights = values.clipped().as_array()
-        return True
+        return NmpcMemory(self.new_ladder())
 
     def control(self, observation: TrackingObservation, memory: NmpcMemory) -> tuple[float, float]:
         """First input of the plan, or what replaces it."""
@@ -155,67 +111,26 @@ class IpoptNmpc(TrackingAgent[NmpcMemory]):
         memory.solution = solution
         if solution.status is Status.SUCCESS and solution.inputs is not None:
             memory.warm, memory.plan, memory.age, memory.failures = warm, solution.inputs, 0, 0
-            memory.fallback = ""
+            memory.ladder.fallback = ""
             return float(solution.inputs[0, 0]), float(solution.inputs[0, 1])
-        memory.counts[solution.status.value] += 1
-        return self._replace(observation, memory)
+        return self._fail(observation, memory, solution.status)
 
     def control_blind(
         self, observation: TrackingObservation, memory: NmpcMemory
     ) -> tuple[float, float]:
         """An observation that is not finite counts as a failed solve, its status NAN."""
         memory.solution = Solution(Status.NAN, None, None, None, np.nan, 0, 0.0)
-        memory.counts[Status.NAN.value] += 1
-        return self._replace(observation, memory)
+        return self._fail(observation, memory, Status.NAN)
 
-    def situation(self, observation: TrackingObservation) -> tuple[Array, Array, Array]:
-        """The problem's parameters from an observation, in the frame of the path's foot point.
-
-        Returns
-        -------
-        state
-            (6,) [vx, vy, psi, r, X, Y]: X is 0 and Y the lateral error.
-        last_input
-            (2,) [a, delta] in force, within their bounds.
-        reference
-            (N + 1, 4) [vx, psi, X, Y] at the horizon's nodes.
-        """
-        low, high = self.problem.input_bounds
-        o = observation
-        state = np.array(
-            [
-                o.longitudinal_speed,
-                o.lateral_speed,
-                o.heading_error,
-                o.yaw_rate,
-                0.0,
-                o.lateral_error,
-            ]
-        )
-        last = np.array([o.acceleration, o.steering_angle]).clip(low, high)
-        nodes = local_reference(o, self.problem.period)
-        stacked = np.stack([nodes.speed, nodes.heading, nodes.x, nodes.y], axis=-1)
-        return state, last, stacked[: self.problem.horizon + 1]
-
-    def _replace(self, observation: TrackingObservation, memory: NmpcMemory) -> tuple[float, float]:
-        """Next rung of the ladder after a failed solve; the warm start is dropped."""
+    def _fail(
+        self, observation: TrackingObservation, memory: NmpcMemory, status: Status
+    ) -> tuple[float, float]:
         memory.warm = None
         memory.failures += 1
         memory.age += 1
-        # Kept up to date on every rung, since Stanley's own memory belongs to a driven episode.
-        seen = all(np.isfinite(entry).all() for entry in observation)
-        fallback = self._fallback.control if seen else self._fallback.control_blind
-        a, delta = fallback(observation, memory.fallback_memory)
-        if memory.failures > self.max_failures:
-            memory.fallback = "stop"
-            a, _ = super().control_blind(observation, memory)
-        elif memory.plan is not None and memory.age < len(memory.plan):
-            memory.fallback = "plan"
-            a, delta = (float(value) for value in memory.plan[memory.age])
-        else:
-            memory.fallback = "stanley"
-        memory.counts[memory.fallback] += 1
-        return a, delta
+        return self.replace(
+            observation, memory.ladder, status.value, memory.plan, memory.age, memory.failures
+        )
 
     def diagnostics(self, memory: NmpcMemory) -> dict[str, Any]:
         """Last solve of one vehicle: status, seconds, iterations, cost, slack (3,), plan.
@@ -231,6 +146,6 @@ class IpoptNmpc(TrackingAgent[NmpcMemory]):
             "iterations": solution.iterations,
             "cost": solution.cost,
             "slack": None if solution.slack is None else solution.slack.max(axis=0),
-            "fallback": memory.fallback,
+            "fallback": memory.ladder.fallback,
             "plan": None if solution.states is None else solution.states[:, 4:],
         }

@@ -1,0 +1,243 @@
+"""The LPV-NMPC as an agent in real time: `lpv-nmpc`."""
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.base import Action, DrivingTask
+from agents.nmpc import interior_point, rti
+from agents.nmpc.base import Ladder, NmpcAgent
+from agents.nmpc.problem import INPUTS, STATES
+from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
+from agents.weights import TrackingWeights, WeightSchedule
+from lpv_track_env.observation import TrackingObservation
+from lpv_track_env.vehicle import VehicleParameters
+
+Array = NDArray[np.float64]
+
+
+class RtiMemory:
+    """What the real-time NMPC remembers of n vehicles: arrays for compiled code, a row a vehicle.
+
+    `plans` (n, N, 2), `flags` (n, FLAGS), `told` (n, TOLD), `states` (n, N + 1, 6) as `rti` has
+    them; `actions` (n, 2) of the last step.
+    """
+
+    def __init__(self, rows: int, horizon: int) -> None:
+        self.plans = np.zeros((rows, horizon, INPUTS))
+        self.flags = np.zeros((rows, rti.FLAGS), dtype=np.int64)
+        self.told = np.zeros((rows, rti.TOLD))
+        self.states = np.zeros((rows, horizon + 1, STATES))
+        self.actions = np.zeros((rows, INPUTS))
+        self.bands: list[int | None] = [None] * rows
+        self.ladders: dict[int, Ladder] = {}
+        """Of rows in which a solve has failed in this episode."""
+        self.seconds = 0.0
+        """Time of the last step's solves, s, all rows together."""
+
+    def __len__(self) -> int:
+        return len(self.plans)
+
+    def __getitem__(self, row: int) -> "RtiRow":
+        if not -len(self) <= row < len(self):
+            raise IndexError(f"row {row} of {len(self)}")
+        return RtiRow(self, row % len(self))
+
+    def clear(self, row: int) -> None:
+        """Forget a row: a new episode begins there."""
+        self.flags[row] = 0
+        self.bands[row] = None
+        self.ladders.pop(row, None)
+
+
+@dataclass(frozen=True)
+class RtiRow:
+    """One vehicle's part of an `RtiMemory`."""
+
+    memory: RtiMemory
+    row: int
+
+
+class RtiNmpc(NmpcAgent[RtiRow]):
+    """The LPV-NMPC of kumar2025lpv by real-time iterations: microseconds a solve.
+
+    Parameters
+    ----------
+    task
+        What is driven.
+    horizon
+        N, at most the observation's preview steps (the default).
+    weights
+        Fixed weights, or a schedule.
+    selection
+        How a schedule chooses: "band" from the sharpest curvature in the preview at every step, or
+        "path" once from the path's sharpest curvature, the paper's rule.
+    model
+        The prediction model and its constraints, by default the task's own vehicle.
+    linear_penalty, quadratic_penalty
+        Prices of slack on (vx, vy, vx'), see `NmpcProblem`.
+    iterations
+        Linearisations a solve; 1 is the real-time iteration, more iterate towards convergence.
+    damping
+        Levenberg term on (a, delta), see `RtiSolver`.
+    tolerance
+        Of the quadratic program.
+    max_failures
+        Failed solves in a row after which the vehicle is brought to a stop.
+
+    The public behaviour is that of `lpv-nmpc-ipopt`, its ladder after failed solves included. A
+    batch of observations (n, size) is solved in one compiled call.
+
+    Raises
+    ------
+    ValueError
+        If the horizon is longer than the preview, or a setting is out of range.
+    """
+
+    def __init__(
+        self,
+        task: DrivingTask,
+        *,
+        horizon: int | None = None,
+        weights: TrackingWeights | WeightSchedule | None = None,
+        selection: str = "band",
+        model: VehicleParameters | None = None,
+        linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),
+        quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0),
+        iterations: int = 1,
+        damping: tuple[float, float] = DAMPING,
+        tolerance: float = 1e-9,
+        max_failures: int = 10,
+    ) -> None:
+        super().__init__(
+            task,
+            horizon=horizon,
+            weights=weights,
+            selection=selection,
+            model=model,
+            linear_penalty=linear_penalty,
+            quadratic_penalty=quadratic_penalty,
+            max_failures=max_failures,
+        )
+        self.solver = RtiSolver(
+            self.problem, iterations=iterations, damping=damping, tolerance=tolerance
+        )
+        self._work = np.zeros(rti.room(self.problem.horizon))
+        self._memory: RtiMemory | None = None
+        self._size = task.layout.size
+
+    def control(self, observation: TrackingObservation, memory: RtiRow) -> tuple[float, float]:
+        """Inputs for one observation, by `predict`."""
+        flat = np.concatenate([np.ravel(entry) for entry in observation])
+        rows = self._new(1) if len(memory.memory) != 1 else memory.memory
+        action, _ = self.predict(flat, rows)
+        return float(action[0]), float(action[1])
+
+    def new_memory(self) -> RtiRow:
+        """Nothing solved yet, for one vehicle."""
+        return RtiRow(self._new(1), 0)
+
+    def _new(self, rows: int) -> RtiMemory:
+        return RtiMemory(rows, self.problem.horizon)
+
+    def reset(self) -> None:
+        """Forget everything: the next call begins new episodes."""
+        self._memory = None
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: NDArray[Any],
+        state: RtiMemory | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,  # noqa: ARG002  part of the protocol
+    ) -> tuple[Action, RtiMemory]:
+        """Action (2,) for one observation (size,), or (n, 2) for a batch; and the memory.
+
+        Raises
+        ------
+        ValueError
+            If the observation does not have this agent's layout.
+        """
+        rows = np.asarray(observation, dtype=np.float64)
+        single = rows.ndim == 1
+        if single:
+            rows = rows.reshape(1, -1)
+        if rows.shape[1] != self._size:
+            self.task.layout.unpack(observation)  # raises, saying what is wrong
+        n = rows.shape[0]
+        memory = self._memory if state is None else state
+        if memory is None or len(memory) != n:
+            memory = self._new(n)
+        if state is None:
+            self._memory = memory
+        if episode_start is not None:
+            for row in np.flatnonzero(np.broadcast_to(episode_start, (n,))):
+                memory.clear(int(row))
+        weights = self._weights_of(rows, memory)
+        began = time.perf_counter()
+        failed = rti.control(
+            rows, weights, self.solver.constants, memory.plans, memory.flags, memory.told,
+            memory.states, memory.actions, self._work,
+        )  # fmt: skip
+        memory.seconds = time.perf_counter() - began
+        if memory.ladders or failed:
+            self._replace_failed(rows, memory)
+        actions = memory.actions.astype(np.float32)
+        np.clip(actions, self._low, self._high, out=actions)
+        return (actions[0] if single else actions), memory
+
+    def _weights_of(self, rows: Array, memory: RtiMemory) -> Array:
+        if self._schedule is None:
+            return self._weights[np.newaxis]
+        weights = np.empty((len(rows), self._weights.size))
+        curvature = self.task.layout.unpack(rows).preview_curvature[:, : self.problem.horizon]
+        for row, preview in enumerate(curvature):
+            if np.isfinite(preview).all():
+                chosen, memory.bands[row] = self._schedule.select(preview, memory.bands[row])
+                weights[row] = chosen.clipped().as_array()
+            else:
+                weights[row] = self._weights
+        return weights
+
+    def _replace_failed(self, rows: Array, memory: RtiMemory) -> None:
+        """Put what the ladder says in place of failed solves' actions."""
+        for ladder in memory.ladders.values():
+            ladder.fallback = ""
+        for row in np.flatnonzero(memory.told[:, rti.CODE] != rti.SUCCESS).tolist():
+            ladder = memory.ladders.setdefault(row, self.new_ladder())
+            _, planned, age, failures = memory.flags[row].tolist()
+            action = self.replace(
+                self.task.layout.unpack(rows[row]),
+                ladder,
+                STATUS[int(memory.told[row, rti.CODE])].value,
+                memory.plans[row] if planned else None,
+                age,
+                failures,
+            )
+            memory.actions[row] = np.nan_to_num(action, nan=0.0)
+
+    def diagnostics(self, memory: RtiRow) -> dict[str, Any]:
+        """Last solve of one vehicle: status, seconds, iterations, cost, slack (3,), plan.
+
+        `plan` (N + 1, 2) holds the predicted positions in the frame of the path's foot point;
+        `iterations` are those of the interior-point method; `seconds` those of the whole batch,
+        shared out evenly.
+        """
+        batch, row = memory.memory, memory.row
+        told = batch.told[row]
+        status = STATUS[int(told[rti.CODE])]
+        solved = int(told[rti.CODE]) == rti.SUCCESS
+        order = np.array(interior_point.SLACK_OF)
+        ladder = batch.ladders.get(row)
+        return {
+            "status": status.value,
+            "seconds": batch.seconds / len(batch),
+            "iterations": int(told[rti.INNER]),
+            "cost": float(told[rti.COST]),
+            "slack": told[rti.SLACK : rti.SLACK + 3][order] if solved else None,
+            "fallback": "" if ladder is None else ladder.fallback,
+            "plan": batch.states[row, :, 4:].copy() if solved else None,
+        }

@@ -1,0 +1,188 @@
+"""The fast solver of the NMPC's problem: a structured real-time iteration in compiled code."""
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.nmpc import interior_point, linearisation, rti
+from agents.nmpc.linearisation import Linearisation
+from agents.nmpc.problem import INPUTS, STATES, NmpcProblem, Solution, Status
+
+Array = NDArray[np.float64]
+
+STATUS = {
+    rti.SUCCESS: Status.SUCCESS,
+    rti.MAXITER: Status.MAXITER,
+    rti.NOT_FINITE: Status.NAN,
+    rti.QP_FAILURE: Status.QP_FAILURE,
+}
+DAMPING = (0.0, 0.3)
+"""Levenberg term on (a, delta)."""
+
+
+def limits(problem: NmpcProblem, damping: tuple[float, float]) -> Array:
+    """Numbers of the quadratic program as `interior_point` takes them, (LIMITS_SIZE,)."""
+    car = problem.vehicle
+    first, steps = problem.input_steps[0], problem.input_steps[-1]
+    if problem.horizon == 1:
+        steps = first
+    order = np.array(interior_point.SLACK_OF)
+    return np.array(
+        [
+            *car.acceleration_range,
+            car.max_steering_angle,
+            *steps,
+            *first,
+            *car.speed_range,
+            *car.longitudinal_acceleration_range,
+            car.max_lateral_velocity_ratio,
+            *np.array(problem.linear_penalty)[order],
+            *np.array(problem.quadratic_penalty)[order],
+            *damping,
+        ]
+    )
+
+
+class RtiSolver:
+    """Real-time iteration, or damped sequential programming to convergence, on the problem.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    iterations
+        Linearisations a solve: 1 is the real-time iteration.
+    damping
+        Levenberg term on (a, delta), added to R about the last plan: it costs nothing at
+        convergence and keeps full Gauss-Newton steps from cycling.
+    tolerance
+        Mean product t lam and infeasibility at which a quadratic program is solved.
+
+    Raises
+    ------
+    ValueError
+        For no iterations, a negative damping or a tolerance that is not positive.
+    """
+
+    def __init__(
+        self,
+        problem: NmpcProblem,
+        *,
+        iterations: int = 1,
+        damping: tuple[float, float] = DAMPING,
+        tolerance: float = 1e-9,
+    ) -> None:
+        if iterations < 1:
+            raise ValueError(f"iterations must be at least 1, not {iterations}")
+        if not min(damping) >= 0.0:
+            raise ValueError(f"damping must not be negative, not {damping}")
+        if not tolerance > 0.0:
+            raise ValueError(f"tolerance must be positive, not {tolerance}")
+        self.problem = problem
+        self.damping = (float(damping[0]), float(damping[1]))
+        first = problem.period if problem.first_period is None else problem.first_period
+        self.constants = np.concatenate(
+            [
+                problem.vehicle.as_array(),
+                [
+                    problem.period / problem.substeps,
+                    problem.substeps,
+                    problem.period,
+                    min(first / problem.period, 1.0),
+                    tolerance,
+                    iterations,
+                ],
+                limits(problem, self.damping),
+            ]
+        )
+        n = problem.horizon
+        self._work = np.zeros(rti.space(n))
+        self._told = np.zeros(rti.TOLD)
+        self._states = np.zeros((n + 1, STATES))
+
+    def solve(
+        self,
+        state: Array,
+        last_input: Array,
+        reference: Array,
+        weights: Array,
+        warm: Array | None = None,
+    ) -> tuple[Solution, Array | None]:
+        """Solve from `state` (6,), with the input in force (2,) and the weights (10,).
+
+        `reference` is (N + 1, 4). `warm` is what the last solve returned, shifted here by one
+        control period; without it the input in force is held. Never raises: what goes wrong is in
+        the status. The solution's cost is that of its predicted states.
+        """
+        began = time.perf_counter()
+        parameters = np.concatenate([state, last_input, reference.ravel(), weights])
+        if not np.isfinite(parameters).all():
+            return Solution(Status.NAN, None, None, None, np.nan, 0, 0.0), None
+        n = self.problem.horizon
+        low, high = self.problem.input_bounds
+        last = np.clip(last_input, low, high)
+        if warm is None:
+            plan = np.tile(last, (n, 1))
+        else:
+            plan = warm.copy()
+            rti.shift(plan, self.constants[rti.SHIFT])
+        code = rti.solve(
+            np.ascontiguousarray(state, dtype=np.float64), last,
+            np.ascontiguousarray(reference, dtype=np.float64),
+            np.ascontiguousarray(weights, dtype=np.float64),
+            self.constants, plan, self._states, self._told, self._work,
+        )  # fmt: skip
+        seconds = time.perf_counter() - began
+        told, status = self._told, STATUS[code]
+        iterations = int(told[rti.OUTER])
+        if status is not Status.SUCCESS:
+            return Solution(status, None, None, None, np.nan, iterations, seconds), None
+        slack = told[rti.SLACK : rti.SLACK + 3][np.array(interior_point.SLACK_OF)]
+        solution = Solution(
+            status,
+            plan,
+            self._states.copy(),
+            slack[np.newaxis],
+            float(told[rti.COST]),
+            iterations,
+            seconds,
+        )
+        return solution, plan
+
+    def linearise(self, state: Array, inputs: Array) -> Linearisation:
+        """Roll `inputs` (N, 2) out from `state` (6,) and differentiate along the way."""
+        states, records = self._records(state, inputs)
+        return linearisation.unpacked(states, records)
+
+    def solve_qp(
+        self, state: Array, last_input: Array, reference: Array, weights: Array, inputs: Array
+    ) -> tuple[Status, Array]:
+        """Solve the program linearised along the roll-out of `inputs` (N, 2); its inputs."""
+        plan = np.ascontiguousarray(inputs, dtype=np.float64)
+        base, records = self._records(state, plan)
+        n = self.problem.horizon
+        found, states, slack = np.zeros((n, INPUTS)), np.zeros((n + 1, STATES)), np.zeros((3, n))
+        code, _ = interior_point.solve_qp(
+            records, base, plan, np.asarray(last_input, dtype=np.float64),
+            np.ascontiguousarray(reference, dtype=np.float64),
+            np.asarray(weights, dtype=np.float64), self.constants[rti.LIMITS :],
+            self.constants[rti.TOLERANCE], states, found, slack, self._work,
+        )  # fmt: skip
+        status = {
+            interior_point.OPTIMAL: Status.SUCCESS,
+            interior_point.OUT_OF_ITERATIONS: Status.MAXITER,
+            interior_point.BROKEN: Status.QP_FAILURE,
+        }[code]
+        return status, found
+
+    def _records(self, state: Array, inputs: Array) -> tuple[Array, Array]:
+        n = len(inputs)
+        states, records = np.zeros((n + 1, STATES)), np.zeros((n, linearisation.RECORD))
+        states[0] = state
+        linearisation.differentiate_along(
+            np.ascontiguousarray(inputs, dtype=np.float64), self.constants,
+            self.constants[rti.STEP], int(self.constants[rti.SUBSTEPS]), states, records,
+            np.zeros(linearisation.SCRATCH),
+        )  # fmt: skip
+        return states, records
