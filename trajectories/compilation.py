@@ -1,6 +1,7 @@
 """Compile numerical functions with numba, cached on disk, never stale."""
 
 import hashlib
+import sys
 import warnings
 from collections.abc import Callable
 from functools import cache
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from numba.core import event
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -33,7 +35,7 @@ def _warn_of_no_cache() -> None:
         "numba finds no writable cache folder: compiling anew in this process "
         "(set NUMBA_CACHE_DIR to a writable folder to avoid the wait)",
         RuntimeWarning,
-        stacklevel=3,
+        stacklevel=4,
     )
 
 
@@ -44,12 +46,50 @@ def _package(folder: Path) -> Path:
     return folder
 
 
+class _Announcement(event.Listener):
+    """Says once in a process that something is being compiled: no silent wait."""
+
+    def __init__(self) -> None:
+        self.said = False
+
+    def on_start(self, event: event.Event) -> None:
+        function = getattr(event.data.get("dispatcher"), "py_func", None)
+        if self.said or getattr(function, "__module__", "").partition(".")[0] not in PACKAGES:
+            return
+        self.said = True
+        print(
+            "lpv-track-env: compiling numerical code (some seconds, once; then kept on disk) ...",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+PACKAGES = ("trajectories", "lpv_track_env", "agents", "experiments")
+event.register("numba:compile", _Announcement())
+
+
 def compiled(function: Function) -> Function:
     """`numba.njit` with IEEE arithmetic, an on-disk cache, and division by zero giving inf.
 
     Where no cache folder is writable it warns once and compiles in every process.
     """
-    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
+    return _compile(function, "never")
+
+
+def inlined(function: Function) -> Function:
+    """`compiled`, and put into its callers as it stands.
+
+    For large functions with few callers: each level of calls between large functions is optimised
+    all over again, which takes seconds. Not for functions called from parallel loops.
+    """
+    return _compile(function, "always")
+
+
+def _compile(function: Function, inline: str) -> Function:
+    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False, "inline": inline}
     try:
         dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:

@@ -26,10 +26,10 @@ from typing import Any
 from numpy.typing import NDArray
 
 from agents.nmpc import riccati
-from agents.nmpc.linearisation import RATE, RATE_DELTA, RATE_R, RATE_VX, RATE_VY, RECORD
-from agents.nmpc.riccati import GAIN, NODE_HESSIAN, STAGE_GRADIENT, STAGE_HESSIAN
+from agents.nmpc.linearisation import RATE, RATE_DELTA, RATE_R, RATE_VX, RATE_VY
+from agents.nmpc.riccati import BARRIER, GAIN, SLOPE
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled, inlined
 
 Array = NDArray[Any]
 Float = Any
@@ -63,48 +63,7 @@ ACCEPTABLE = 1e-6
 @compiled
 def workspace_size(n: int) -> int:
     """Length of the workspace of `solve_qp` for N = n."""
-    nodes = (NODE_HESSIAN + 12) * (n + 1)
-    stages = (STAGE_HESSIAN + STAGE_GRADIENT + GAIN + 2) * n
-    return nodes + stages + (9 * PAIRS + FUNCTIONALS + 6 + 1) * n
-
-
-@compiled
-def cost_gradient(
-    states: Array, inputs: Array, plan: Array, reference: Array, weights: Array, limits: Array,
-    node_gradient: Array, stage_gradient: Array,
-) -> None:  # fmt: skip
-    """Gradient of the cost (its damping towards `plan` included) at states and inputs."""
-    n = inputs.shape[0]
-    for i in range(n + 1):
-        offset = 4 if i == n else 0
-        x, y, g = states[i], reference[i], node_gradient[i]
-        g[VX] = weights[offset] * (x[VX] - y[0])
-        g[PSI] = weights[offset + 1] * (x[PSI] - y[1])
-        g[X] = weights[offset + 2] * (x[X] - y[2])
-        g[Y] = weights[offset + 3] * (x[Y] - y[3])
-        g[VY] = g[YAW_RATE] = 0.0
-    for i in range(n):
-        g = stage_gradient[i]
-        g[0] = weights[8] * inputs[i, 0] + limits[DAMPING_A] * (inputs[i, 0] - plan[i, 0])
-        g[1] = weights[9] * inputs[i, 1] + limits[DAMPING_DELTA] * (inputs[i, 1] - plan[i, 1])
-        g[2] = g[3] = 0.0
-
-
-@compiled
-def cost_hessian(
-    weights: Array, limits: Array, node_hessian: Array, stage_hessian: Array
-) -> None:
-    """Hessian of the cost alone."""
-    n = stage_hessian.shape[0]
-    for i in range(n + 1):
-        offset = 4 if i == n else 0
-        h = node_hessian[i]
-        h[0], h[1], h[2] = weights[offset], 0.0, weights[offset + 1]
-        h[3], h[4], h[5] = weights[offset + 2], weights[offset + 3], 0.0
-    for i in range(n):
-        h = stage_hessian[i]
-        h[0], h[1] = weights[8] + limits[DAMPING_A], weights[9] + limits[DAMPING_DELTA]
-        h[2] = h[3] = h[4] = 0.0
+    return 6 * (n + 1) + (2 + GAIN + BARRIER + SLOPE + 9 * PAIRS + FUNCTIONALS + 6 + 1) * n
 
 
 @compiled
@@ -182,9 +141,12 @@ def follow(records: Array, base: Array, plan: Array, inputs: Array, states: Arra
 
 
 @compiled
-def start(gaps: Array, limits: Array, t: Array, lam: Array, residual: Array) -> None:
-    """Start of all pairs: products at START_BARRIER, t at least some share of its range."""
-    n = gaps.shape[1]
+def start(gaps: Array, limits: Array, t: Array, lam: Array, residual: Array) -> Float:
+    """Start of all pairs: products at START_BARRIER, t at least some share of its range.
+
+    Returns the largest residual t - gap.
+    """
+    n, worst = gaps.shape[1], 0.0
     for k in range(8):
         kind = k // 2
         if kind == 0:
@@ -198,6 +160,7 @@ def start(gaps: Array, limits: Array, t: Array, lam: Array, residual: Array) -> 
         for i in range(n):
             t[k, i] = max(gaps[k, i], START_DISTANCE * reach)
             residual[k, i] = t[k, i] - gaps[k, i]
+            worst = max(worst, residual[k, i])
             lam[k, i] = START_BARRIER / t[k, i]
     for soft in range(3):
         first, second, own = 8 + 3 * soft, 9 + 3 * soft, 10 + 3 * soft
@@ -212,87 +175,74 @@ def start(gaps: Array, limits: Array, t: Array, lam: Array, residual: Array) -> 
             lam[first, i] = START_BARRIER / t[first, i]
             lam[second, i] = START_BARRIER / t[second, i]
             lam[own, i] = START_BARRIER / slack
+    return worst
 
 
 @compiled
 def condense(
-    records: Array, t: Array, lam: Array, residual: Array, share: Float, barrier: Float,
-    corrections: Array, corrected: bool, hessian: bool, limits: Array, inverse: Array,
-    weight: Array, base: Array, eliminated: Array, node_hessian: Array, stage_hessian: Array, node_gradient: Array,
-    stage_gradient: Array,
+    t: Array, lam: Array, residual: Array, share: Float, centre: Float, corrections: Array,
+    predicting: bool, limits: Array, inverse: Array, weight: Array, base: Array,
+    eliminated: Array, barrier: Array, slope: Array,
 ) -> None:  # fmt: skip
-    """Add the pairs' part to the gradients, and to the Hessians if asked.
+    """Fill what the pairs add to the gradient (`slope`) and, if predicting, the Hessian.
 
-    `base` (PAIRS, N) gets each pair's multiplier for a step of no length, `inverse` 1 / t (with the
-    Hessian), `eliminated` (6, N) the slack's numerator and 1 / denominator.
+    `base` (PAIRS, N) gets each pair's multiplier for a step of no length, `inverse` 1 / t,
+    `weight` lam / t, `eliminated` (6, N) the slacks' numerators and 1 / denominators.
     """
     n = t.shape[1]
     for k in range(PAIRS):
         tk, lk, rk, ck = t[k], lam[k], residual[k], corrections[k]
         ik, wk, bk = inverse[k], weight[k], base[k]
-        if hessian:
+        if predicting:
             for i in range(n):
                 ik[i] = 1.0 / tk[i]
                 wk[i] = lk[i] * ik[i]
-        if corrected:
-            for i in range(n):
-                bk[i] = (barrier - ck[i]) * ik[i] + wk[i] * share * rk[i]
+                bk[i] = wk[i] * share * rk[i]
         else:
             for i in range(n):
-                bk[i] = barrier * ik[i] + wk[i] * share * rk[i]
+                bk[i] = (centre - ck[i]) * ik[i] + wk[i] * share * rk[i]
+    for f in range(4):
+        high, low, into = base[2 * f], base[2 * f + 1], slope[f]
+        for i in range(n):
+            into[i] = high[i] - low[i]
+        if predicting:
+            high, low, into = weight[2 * f], weight[2 * f + 1], barrier[f]
+            for i in range(n):
+                into[i] = high[i] + low[i]
     for soft in range(3):
         first, second, own = 8 + 3 * soft, 9 + 3 * soft, 10 + 3 * soft
         linear, quadratic = limits[LINEAR + soft], limits[QUADRATIC + soft]
         top, bottom = eliminated[2 * soft], eliminated[2 * soft + 1]
+        b1, b2, b3, slack = base[first], base[second], base[own], t[own]
+        w1, w2, w3 = weight[first], weight[second], weight[own]
         for i in range(n):
-            top[i] = (
-                base[first, i] + base[second, i] + base[own, i] - linear - quadratic * t[own, i]
-            )
-        if hessian:
+            top[i] = b1[i] + b2[i] + b3[i] - linear - quadratic * slack[i]
+        if predicting:
             for i in range(n):
-                bottom[i] = 1.0 / (
-                    quadratic
-                    + weight[first, i]
-                    + weight[second, i]
-                    + weight[own, i]
-                )
-    ratio = limits[RATIO]
-    for i in range(n):
-        gu = stage_gradient[i]
-        gu[0] += base[0, i] - base[1, i]
-        gu[1] += base[2, i] - base[3, i]
-        gu[2] += base[4, i] - base[5, i]
-        gu[3] += base[6, i] - base[7, i]
-        node, here, e = node_gradient[i + 1], node_gradient[i], records[i]
-        w8, w9 = weight[8, i], weight[9, i]
-        node[VX] += base[8, i] - base[9, i] - (w8 - w9) * eliminated[0, i] * eliminated[1, i]
-        w11, w12 = weight[11, i], weight[12, i]
-        by_rate = base[11, i] - base[12, i] - (w11 - w12) * eliminated[2, i] * eliminated[3, i]
-        here[VX] += by_rate * e[RATE_VX]
-        here[VY] += by_rate * e[RATE_VY]
-        here[YAW_RATE] += by_rate * e[RATE_R]
-        gu[0] += by_rate
-        gu[1] += by_rate * e[RATE_DELTA]
-        w14, w15 = weight[14, i], weight[15, i]
-        taken = eliminated[4, i] * eliminated[5, i]
-        right, left = base[14, i] - w14 * taken, base[15, i] - w15 * taken
-        node[VX] -= ratio * (right + left)
-        node[VY] += right - left
-        if hessian:
-            hu, hx = stage_hessian[i], node_hessian[i + 1]
-            hu[0] += weight[0, i] + weight[1, i]
-            hu[1] += weight[2, i] + weight[3, i]
-            hu[2] += weight[4, i] + weight[5, i]
-            hu[3] += weight[6, i] + weight[7, i]
-            # w1 + w2 - (w1 - w2)^2 / (quadratic + sum w), with no difference of large numbers.
-            own = limits[QUADRATIC] + weight[10, i]
-            hx[0] += ((w8 + w9) * own + 4.0 * w8 * w9) * eliminated[1, i]
-            own = limits[QUADRATIC + 1] + weight[13, i]
-            hu[4] += ((w11 + w12) * own + 4.0 * w11 * w12) * eliminated[3, i]
-            own = limits[QUADRATIC + 2] + weight[16, i]
-            hx[0] += ratio * ratio * (w14 + w15) * own * eliminated[5, i]
-            hx[1] += ((w14 + w15) * own + 4.0 * w14 * w15) * eliminated[5, i]
-            hx[5] += ratio * (w15 - w14) * own * eliminated[5, i]
+                bottom[i] = 1.0 / (quadratic + w1[i] + w2[i] + w3[i])
+        # w1 + w2 - (w1 - w2)^2 / (quadratic + sum w) and its like, without differences of large
+        # numbers.
+        if soft < 2:
+            into, row = slope[5 - soft], barrier[5 - soft]
+            for i in range(n):
+                into[i] = b1[i] - b2[i] - (w1[i] - w2[i]) * top[i] * bottom[i]
+            if predicting:
+                for i in range(n):
+                    apart = quadratic + w3[i]
+                    row[i] = ((w1[i] + w2[i]) * apart + 4.0 * w1[i] * w2[i]) * bottom[i]
+        else:
+            ratio, by_vx, by_vy = limits[RATIO], slope[5], slope[6]
+            for i in range(n):
+                taken = top[i] * bottom[i]
+                right, left = b1[i] - w1[i] * taken, b2[i] - w2[i] * taken
+                by_vx[i] -= ratio * (right + left)
+                by_vy[i] = right - left
+            if predicting:
+                for i in range(n):
+                    apart = (quadratic + w3[i]) * bottom[i]
+                    barrier[5, i] += ratio * ratio * (w1[i] + w2[i]) * apart
+                    barrier[6, i] = ratio * (w2[i] - w1[i]) * apart
+                    barrier[7, i] = (w1[i] + w2[i]) * apart + 4.0 * w1[i] * w2[i] * bottom[i]
 
 
 @compiled
@@ -355,7 +305,7 @@ def expand(
     return 1.0 / worst
 
 
-@compiled
+@inlined
 def solve_qp(
     records: Array, base_states: Array, plan: Array, last: Array, reference: Array, weights: Array,
     limits: Array, tolerance: Float, states: Array, inputs: Array, slack: Array, work: Array,
@@ -367,25 +317,21 @@ def solve_qp(
     numbers, `work` (workspace_size(N),).
     """
     n = plan.shape[0]
+    damping_a, damping_delta = limits[DAMPING_A], limits[DAMPING_DELTA]
     at = 0
-    node_hessian = work[at : at + NODE_HESSIAN * (n + 1)].reshape(n + 1, NODE_HESSIAN)
-    at += NODE_HESSIAN * (n + 1)
-    node_gradient = work[at : at + 6 * (n + 1)].reshape(n + 1, 6)
-    at += 6 * (n + 1)
     dx = work[at : at + 6 * (n + 1)].reshape(n + 1, 6)
     at += 6 * (n + 1)
-    stage_hessian = work[at : at + STAGE_HESSIAN * n].reshape(n, STAGE_HESSIAN)
-    at += STAGE_HESSIAN * n
-    stage_gradient = work[at : at + STAGE_GRADIENT * n].reshape(n, STAGE_GRADIENT)
-    at += STAGE_GRADIENT * n
-    gains = work[at : at + GAIN * n].reshape(n, GAIN)
-    at += GAIN * n
     du = work[at : at + 2 * n].reshape(n, 2)
     at += 2 * n
+    gains = work[at : at + GAIN * n].reshape(n, GAIN)
+    at += GAIN * n
+    barrier = work[at : at + BARRIER * n].reshape(BARRIER, n)
+    at += BARRIER * n
+    slope = work[at : at + SLOPE * n].reshape(SLOPE, n)
+    at += SLOPE * n
     pairs = work[at : at + 9 * PAIRS * n].reshape(9, PAIRS, n)
     gaps, t, lam, residual = pairs[0], pairs[1], pairs[2], pairs[3]
-    inverse, base, dt, dlam = pairs[4], pairs[5], pairs[6], pairs[7]
-    weight = pairs[8]
+    inverse, weight, base, dt, dlam = pairs[4], pairs[5], pairs[6], pairs[7], pairs[8]
     at += 9 * PAIRS * n
     functionals = work[at : at + FUNCTIONALS * n].reshape(FUNCTIONALS, n)
     at += FUNCTIONALS * n
@@ -393,106 +339,108 @@ def solve_qp(
     at += 6 * n
     longest = work[at : at + n]
 
-    # Without inequalities first: most of the time they are all kept.
-    cost_gradient(
-        base_states, plan, plan, reference, weights, limits, node_gradient, stage_gradient
-    )
-    cost_hessian(weights, limits, node_hessian, stage_hessian)
-    riccati.factor(records, node_hessian, stage_hessian, gains)
-    riccati.solve(records, gains, node_gradient, stage_gradient, dx, du)
+    barrier[:] = 0.0
+    slope[:] = 0.0
     for i in range(n):
-        inputs[i, 0], inputs[i, 1] = plan[i, 0] + du[i, 0], plan[i, 1] + du[i, 1]
+        inputs[i, 0], inputs[i, 1] = plan[i, 0], plan[i, 1]
     for i in range(n + 1):
         for k in range(6):
-            states[i, k] = base_states[i, k] + dx[i, k]
-    least = measure_gaps(records, base_states, plan, states, inputs, last, limits, gaps)
-    total = 0.0
-    for i in range(n):
-        slack[0, i] = slack[1, i] = slack[2, i] = 0.0
-        total += inputs[i, 0] + inputs[i, 1]
-        for k in range(6):
-            total += states[i + 1, k]
-    if not math.isfinite(total):
-        return BROKEN, 0
-    if least >= 0.0:
-        return OPTIMAL, 0
-
-    clamp(inputs, last, limits)
-    follow(records, base_states, plan, inputs, states)
-    measure_gaps(records, base_states, plan, states, inputs, last, limits, gaps)
-    start(gaps, limits, t, lam, residual)
-    share = 1.0  # of the first residual that is left
-    worst = 0.0
-    for k in range(8):
-        for i in range(n):
-            worst = max(worst, residual[k, i])
-    count = float(PAIRS * n)
-    for iteration in range(1, MAX_ITERATIONS + 1):
-        mu = 0.0
-        for k in range(PAIRS):
-            tk, lk = t[k], lam[k]
-            for i in range(n):
-                mu += tk[i] * lk[i]
-        mu /= count
-        if mu <= tolerance and share * worst <= tolerance:
-            return _finish(t, inputs, last, limits, slack, OPTIMAL), iteration - 1
-        cost_gradient(
-            states, inputs, plan, reference, weights, limits, node_gradient, stage_gradient
-        )
-        cost_hessian(weights, limits, node_hessian, stage_hessian)
-        condense(
-            records, t, lam, residual, share, 0.0, dt, False, True, limits, inverse, weight,
-            base, eliminated, node_hessian, stage_hessian, node_gradient, stage_gradient,
+            states[i, k] = base_states[i, k]
+    mu, centre, worst, share = START_BARRIER, 0.0, 0.0, 1.0
+    # Pass 0 knows no inequalities; then predictors (odd) and correctors (even) take turns. Each
+    # part is called from one place only: compiling takes half as long.
+    for turn in range(2 * MAX_ITERATIONS + 1):
+        predicting = turn % 2 == 1
+        if turn > 0:
+            condense(
+                t, lam, residual, share, centre, dt, predicting, limits, inverse, weight, base,
+                eliminated, barrier, slope,
+            )  # fmt: skip
+        if predicting or turn == 0:
+            riccati.factor(records, weights, damping_a, damping_delta, barrier, gains)
+        riccati.solve(
+            records, gains, weights, damping_a, damping_delta, states, inputs, plan, reference,
+            slope, dx, du,
         )  # fmt: skip
-        riccati.factor(records, node_hessian, stage_hessian, gains)
-        riccati.solve(records, gains, node_gradient, stage_gradient, dx, du)
-        length = expand(
-            records, dx, du, t, lam, residual, share, limits, inverse, weight, base,
-            eliminated, functionals, dt, dlam, longest,
-        )  # fmt: skip
-        length = min(1.0, length)
-        reached = 0.0
-        for k in range(PAIRS):
-            tk, lk, dtk, dlk = t[k], lam[k], dt[k], dlam[k]
-            for i in range(n):
-                reached += (tk[i] + length * dtk[i]) * (lk[i] + length * dlk[i])
-                dtk[i] *= dlk[i]  # the correction
-        reached /= count
-        centring = reached / mu
-        centring = centring * centring * centring
-        cost_gradient(
-            states, inputs, plan, reference, weights, limits, node_gradient, stage_gradient
-        )
-        condense(
-            records, t, lam, residual, share, centring * mu, dt, True, False, limits, inverse,
-            weight, base, eliminated, node_hessian, stage_hessian, node_gradient, stage_gradient,
-        )  # fmt: skip
-        riccati.solve(records, gains, node_gradient, stage_gradient, dx, du)
+        length = 1.0
+        if turn > 0:
+            length = expand(
+                records, dx, du, t, lam, residual, share, limits, inverse, weight, base,
+                eliminated, functionals, dt, dlam, longest,
+            )  # fmt: skip
+        if predicting:
+            centre = _centre(t, lam, dt, dlam, min(1.0, length), mu, longest)
+            continue
         total = 0.0
         for i in range(n):
-            total += du[i, 0] + du[i, 1]
+            total += du[i, 0] + du[i, 1] + dx[i + 1, X]
         if not math.isfinite(total):
-            good = mu <= ACCEPTABLE and share * worst <= ACCEPTABLE
-            code = OPTIMAL if good else BROKEN
-            return _finish(t, inputs, last, limits, slack, code), iteration
-        length = expand(
-            records, dx, du, t, lam, residual, share, limits, inverse, weight, base,
-            eliminated, functionals, dt, dlam, longest,
-        )  # fmt: skip
-        length = min(1.0, max(CAUTION, min(1.0 - mu, LEAST_CAUTION)) * length)
-        for k in range(PAIRS):
-            tk, lk, dtk, dlk = t[k], lam[k], dt[k], dlam[k]
-            for i in range(n):
-                tk[i] += length * dtk[i]
-                lk[i] += length * dlk[i]
+            good = turn > 0 and mu <= ACCEPTABLE and share * worst <= ACCEPTABLE
+            return _finish(t, inputs, last, limits, slack, OPTIMAL if good else BROKEN), turn // 2
+        if turn > 0:
+            length = min(1.0, max(CAUTION, min(1.0 - mu, LEAST_CAUTION)) * length)
+            mu = _update(t, lam, dt, dlam, length, longest)
+            share *= 1.0 - length
         for i in range(n):
             inputs[i, 0] += length * du[i, 0]
             inputs[i, 1] += length * du[i, 1]
         for i in range(n + 1):
             for k in range(6):
                 states[i, k] += length * dx[i, k]
-        share *= 1.0 - length
+        if turn > 0:
+            if mu <= tolerance and share * worst <= tolerance:
+                return _finish(t, inputs, last, limits, slack, OPTIMAL), turn // 2
+            continue
+        kept = True
+        for attempt in range(2):
+            least = measure_gaps(records, base_states, plan, states, inputs, last, limits, gaps)
+            if attempt == 1 or least >= 0.0:
+                break
+            # Start where all inputs keep their limits.
+            kept = False
+            clamp(inputs, last, limits)
+            follow(records, base_states, plan, inputs, states)
+        if kept:
+            slack[:] = 0.0
+            return OPTIMAL, 0
+        worst = start(gaps, limits, t, lam, residual)
     return _finish(t, inputs, last, limits, slack, OUT_OF_ITERATIONS), MAX_ITERATIONS
+
+
+@compiled
+def _update(t: Array, lam: Array, dt: Array, dlam: Array, length: Float, product: Array) -> Float:
+    """Take a step of all pairs; returns the mean product t lam. `product` (N,) is scratch."""
+    product[:] = 0.0
+    for k in range(PAIRS):
+        tk, lk, dtk, dlk = t[k], lam[k], dt[k], dlam[k]
+        for i in range(t.shape[1]):
+            tk[i] += length * dtk[i]
+            lk[i] += length * dlk[i]
+            product[i] += tk[i] * lk[i]
+    return _sum(product) / (PAIRS * t.shape[1])
+
+
+@compiled
+def _centre(
+    t: Array, lam: Array, dt: Array, dlam: Array, length: Float, mu: Float, reached: Array,
+) -> Float:  # fmt: skip
+    """Mehrotra's target for the products; turns `dt` into the second-order corrections dt dlam."""
+    reached[:] = 0.0
+    for k in range(t.shape[0]):
+        tk, lk, dtk, dlk = t[k], lam[k], dt[k], dlam[k]
+        for i in range(t.shape[1]):
+            reached[i] += (tk[i] + length * dtk[i]) * (lk[i] + length * dlk[i])
+            dtk[i] *= dlk[i]
+    share = _sum(reached) / (mu * t.shape[0] * t.shape[1])
+    return share * share * share * mu
+
+
+@compiled
+def _sum(values: Array) -> Float:
+    total = 0.0
+    for i in range(values.shape[0]):
+        total += values[i]
+    return total
 
 
 @compiled

@@ -33,7 +33,7 @@ from lpv_track_env.bicycle import (
     compiled_jacobian,
 )
 from lpv_track_env.kernels import integrate, rotate
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled, inlined
 
 Array = NDArray[Any]
 # Floats inside compiled code; numba ignores annotations, mypy sees what a caller passes.
@@ -190,7 +190,7 @@ def roll_out(inputs: Array, p: Array, h: Float, n: int, states: Array) -> None:
         advance(states[i], inputs[i, 0], inputs[i, 1], p, h, n, states[i + 1])
 
 
-@compiled
+@inlined
 def differentiate_along(
     inputs: Array, p: Array, h: Float, n: int, states: Array, records: Array, scratch: Array
 ) -> None:

@@ -3,11 +3,17 @@
 One step minimises, over dx_0 = 0, dx_{i+1} = A_i dx_i + B_i du_i and du_{-1} = 0,
 
     sum_i 1/2 dx_i' Hx_i dx_i + gx_i' dx_i  +  1/2 du_i' Hu_i du_i + gu_i' du_i
-        + 1/2 h_i (n_i' [dx_i; du_i])^2  +  1/2 (du_i - du_{i-1})' W_i (du_i - du_{i-1})
-        + w_i' (du_i - du_{i-1})
+        + 1/2 h_i (n_i' [dx_i; du_i])^2 + k_i n_i' [dx_i; du_i]
+        + 1/2 (du_i - du_{i-1})' W_i (du_i - du_{i-1}) + w_i' (du_i - du_{i-1})
 
-with Hx diagonal but for (vx, vy), Hu and W diagonal, and n_i the gradient of vx'. The value function
-of stage i has as its arguments dx_i and p = du_{i-1}:
+with n_i the gradient of vx', Hu and W diagonal, and Hx diagonal but for (vx, vy). Hessians and
+gradients are the cost's own, which is taken at a current `states` and `inputs`, plus what the
+inequalities add: rows of `barrier` and `slope` by stage,
+
+    0, 1  a, delta    2, 3  their changes    4  vx'    5..   vx, vy at the period's end
+
+(`barrier` has (vx, vx), (vx, vy), (vy, vy) in 5 to 7). The value function of stage i has as its
+arguments dx_i and p = du_{i-1}:
 
     1/2 x' P x + x' T p + 1/2 p' U p + s' x + t' p
 
@@ -28,17 +34,14 @@ from agents.nmpc.linearisation import (
     RATE_VX,
     RATE_VY,
 )
+from lpv_track_env.bicycle import PSI, VX, X, Y
 from trajectories.compilation import compiled
 
 Array = NDArray[Any]
 Float = Any
 
-NODE_HESSIAN = 6
-"""Of a node: diagonal entries vx, vy, psi, X, Y and the entry (vx, vy) of Hx."""
-STAGE_HESSIAN = 5
-"""Of a stage: Hu's a, delta; W's a, delta; h."""
-STAGE_GRADIENT = 4
-"""Of a stage: gu's a, delta; w's a, delta."""
+BARRIER, SLOPE = 8, 7
+"""Rows of what the inequalities add to Hessian and gradient."""
 GAIN = 21
 """Of a stage: K (2, 6); M^-1 W (2, 2); M^-1 (3); W (2)."""
 NAN = math.nan
@@ -70,20 +73,25 @@ def _dot(
 
 
 @compiled
-def factor(records: Array, node_hessian: Array, stage_hessian: Array, gains: Array) -> None:
-    """Fill `gains` (N, GAIN) for node (N + 1, NODE_HESSIAN) and stage (N, STAGE_HESSIAN) Hessians.
+def factor(
+    records: Array, weights: Array, damping_a: Float, damping_delta: Float, barrier: Array,
+    gains: Array,
+) -> None:  # fmt: skip
+    """Fill `gains` (N, GAIN) for weights (10,), damping on the inputs and `barrier` (BARRIER, N).
 
     A matrix M that is not positive definite shows as gains that are not finite.
     """
     n = records.shape[0]
-    end = node_hessian[n]
-    p00, p11, p22, p44, p55, p01 = end[0], end[1], end[2], end[3], end[4], end[5]
+    q0, q2, q4, q5 = weights[0], weights[1], weights[2], weights[3]
+    ra, rd = weights[8] + damping_a, weights[9] + damping_delta
+    p00, p01, p11 = weights[4] + barrier[5, n - 1], barrier[6, n - 1], barrier[7, n - 1]
+    p22, p44, p55 = weights[5], weights[6], weights[7]
     p02 = p03 = p04 = p05 = p12 = p13 = p14 = p15 = p23 = p24 = p25 = p33 = p34 = p35 = p45 = 0.0
     # T's columns (by a and by delta of the input before) and U.
     ta0 = ta1 = ta2 = ta3 = ta4 = ta5 = td0 = td1 = td2 = td3 = td4 = td5 = 0.0
     uaa = uad = udd = 0.0
     for i in range(n - 1, -1, -1):
-        e, hu, g = records[i], stage_hessian[i], gains[i]
+        e, g = records[i], gains[i]
         a00, a10, a20, a30, a40, a50 = e[0], e[1], e[2], e[3], e[4], e[5]
         a01, a11, a21, a31, a41, a51 = e[6], e[7], e[8], e[9], e[10], e[11]
         a03, a13, a23, a33, a43, a53 = e[12], e[13], e[14], e[15], e[16], e[17]
@@ -105,14 +113,14 @@ def factor(records: Array, node_hessian: Array, stage_hessian: Array, gains: Arr
         gd0, gd1, gd2 = yd[0] + td0, yd[1] + td1, yd[2] + td2
         gd3, gd4, gd5 = yd[3] + td3, yd[4] + td4, yd[5] + td5
         xa, xd = (ga0, ga1, ga2, ga3, ga4, ga5), (gd0, gd1, gd2, gd3, gd4, gd5)
-        h, n_delta = hu[4], e[RATE_DELTA]
+        h, n_delta = barrier[4, i], e[RATE_DELTA]
         bta_a = ba0 * ta0 + ba1 * ta1 + ba2 * ta2 + ba3 * ta3 + ba4 * ta4 + ba5 * ta5
         btd_d = bd0 * td0 + bd1 * td1 + bd2 * td2 + bd3 * td3 + bd4 * td4 + bd5 * td5
         bta_d = ba0 * td0 + ba1 * td1 + ba2 * td2 + ba3 * td3 + ba4 * td4 + ba5 * td5
-        haa = hu[0] + _dot(ba0, ba1, ba2, ba3, ba4, ba5, xa) + bta_a + uaa
-        hdd = hu[1] + _dot(bd0, bd1, bd2, bd3, bd4, bd5, xd) + btd_d + udd
+        haa = ra + barrier[0, i] + _dot(ba0, ba1, ba2, ba3, ba4, ba5, xa) + bta_a + uaa
+        hdd = rd + barrier[1, i] + _dot(bd0, bd1, bd2, bd3, bd4, bd5, xd) + btd_d + udd
         had = _dot(bd0, bd1, bd2, bd3, bd4, bd5, xa) + bta_d + uad
-        wa, wd = hu[2], hu[3]
+        wa, wd = barrier[2, i], barrier[3, i]
         maa, mdd = haa + wa, hdd + wd
         determinant = maa * mdd - had * had
         # A determinant that is not positive gives NaN gains: the caller sees it.
@@ -151,7 +159,7 @@ def factor(records: Array, node_hessian: Array, stage_hessian: Array, gains: Arr
         g[19], g[20] = wa, wd
         if i == 0:
             break
-        node = node_hessian[i]
+        h0, h1, h5 = q0 + barrier[5, i - 1], barrier[7, i - 1], barrier[6, i - 1]
         y0 = _product(
             p00, p01, p02, p03, p04, p05, p11, p12, p13, p14, p15, p22, p23, p24, p25, p33, p34,
             p35, p44, p45, p55, a00, a10, a20, a30, a40, a50,
@@ -169,16 +177,16 @@ def factor(records: Array, node_hessian: Array, stage_hessian: Array, gains: Arr
         y24 = p24 + a42 * p44 + a52 * p45
         y25 = p25 + a42 * p45 + a52 * p55
         # P = Hx + A' P A - G' M^-1 G + k c c'.
-        f00 = _dot(a00, a10, a20, a30, a40, a50, y0) + node[0] + k * c0 * c0 - qa0 * ka0 - qd0 * kd0
-        f01 = _dot(a00, a10, a20, a30, a40, a50, y1) + node[5] + k * c0 * c1 - qa0 * ka1 - qd0 * kd1
+        f00 = _dot(a00, a10, a20, a30, a40, a50, y0) + h0 + k * c0 * c0 - qa0 * ka0 - qd0 * kd0
+        f01 = _dot(a00, a10, a20, a30, a40, a50, y1) + h5 + k * c0 * c1 - qa0 * ka1 - qd0 * kd1
         f03 = _dot(a00, a10, a20, a30, a40, a50, y3) + k * c0 * c3 - qa0 * ka3 - qd0 * kd3
-        f11 = _dot(a01, a11, a21, a31, a41, a51, y1) + node[1] + k * c1 * c1 - qa1 * ka1 - qd1 * kd1
+        f11 = _dot(a01, a11, a21, a31, a41, a51, y1) + h1 + k * c1 * c1 - qa1 * ka1 - qd1 * kd1
         f13 = _dot(a01, a11, a21, a31, a41, a51, y3) + k * c1 * c3 - qa1 * ka3 - qd1 * kd3
         f33 = _dot(a03, a13, a23, a33, a43, a53, y3) + k * c3 * c3 - qa3 * ka3 - qd3 * kd3
         f02 = y0[2] + a42 * y0[4] + a52 * y0[5] + k * c0 * c2 - qa0 * ka2 - qd0 * kd2
         f12 = y1[2] + a42 * y1[4] + a52 * y1[5] + k * c1 * c2 - qa1 * ka2 - qd1 * kd2
         f23 = y3[2] + a42 * y3[4] + a52 * y3[5] + k * c2 * c3 - qa3 * ka2 - qd3 * kd2
-        f22 = y22 + a42 * y24 + a52 * y25 + node[2] + k * c2 * c2 - qa2 * ka2 - qd2 * kd2
+        f22 = y22 + a42 * y24 + a52 * y25 + q2 + k * c2 * c2 - qa2 * ka2 - qd2 * kd2
         kc4, kc5 = k * c4, k * c5
         f04 = y0[4] + kc4 * c0 - qa0 * ka4 - qd0 * kd4
         f05 = y0[5] + kc5 * c0 - qa0 * ka5 - qd0 * kd5
@@ -188,15 +196,17 @@ def factor(records: Array, node_hessian: Array, stage_hessian: Array, gains: Arr
         f25 = y25 + kc5 * c2 - qa2 * ka5 - qd2 * kd5
         f34 = y3[4] + kc4 * c3 - qa3 * ka4 - qd3 * kd4
         f35 = y3[5] + kc5 * c3 - qa3 * ka5 - qd3 * kd5
-        p44 = p44 + node[3] + kc4 * c4 - ga4 * ka4 - gd4 * kd4
+        p44 = p44 + q4 + kc4 * c4 - ga4 * ka4 - gd4 * kd4
         p45 = p45 + kc4 * c5 - ga4 * ka5 - gd4 * kd5
-        p55 = p55 + node[4] + kc5 * c5 - ga5 * ka5 - gd5 * kd5
+        p55 = p55 + q5 + kc5 * c5 - ga5 * ka5 - gd5 * kd5
         p00, p01, p02, p03, p04, p05 = f00, f01, f02, f03, f04, f05
         p11, p12, p13, p14, p15, p22, p23 = f11, f12, f13, f14, f15, f22, f23
         p24, p25, p33, p34, p35 = f24, f25, f33, f34, f35
         # T = K' W, U = W M^-1 (M - W), which loses no digits where W is large.
-        ta0, ta1, ta2, ta3, ta4, ta5 = g[0] * wa, g[1] * wa, g[2] * wa, g[3] * wa, g[4] * wa, g[5] * wa
-        td0, td1, td2, td3, td4, td5 = g[6] * wd, g[7] * wd, g[8] * wd, g[9] * wd, g[10] * wd, g[11] * wd
+        ta0, ta1, ta2 = g[0] * wa, g[1] * wa, g[2] * wa
+        ta3, ta4, ta5 = g[3] * wa, g[4] * wa, g[5] * wa
+        td0, td1, td2 = g[6] * wd, g[7] * wd, g[8] * wd
+        td3, td4, td5 = g[9] * wd, g[10] * wd, g[11] * wd
         uaa = wa * (iaa * haa + iad * had + kfa * fa * wa)
         uad = wa * (iaa * had + iad * hdd + kfa * fd * wd)
         udd = wd * (iad * had + idd * hdd + kfd * fd * wd)
@@ -204,35 +214,44 @@ def factor(records: Array, node_hessian: Array, stage_hessian: Array, gains: Arr
 
 @compiled
 def solve(
-    records: Array, gains: Array, node_gradient: Array, stage_gradient: Array, dx: Array, du: Array
-) -> None:
-    """Fill the step dx (N + 1, 6), du (N, 2) for node (N + 1, 6) and stage (N, 4) gradients.
+    records: Array, gains: Array, weights: Array, damping_a: Float, damping_delta: Float,
+    states: Array, inputs: Array, plan: Array, reference: Array, slope: Array, dx: Array, du: Array,
+) -> None:  # fmt: skip
+    """Fill the step dx (N + 1, 6), du (N, 2) from states (N + 1, 6) and inputs (N, 2).
 
-    Gradients of vx' are to be in the node's and the stage's already.
+    `plan` (N, 2) is what the damping pulls to, `reference` (N + 1, >= 4), `slope` (SLOPE, N).
     """
     n = records.shape[0]
-    end = node_gradient[n]
-    s0, s1, s2, s3, s4, s5 = end[0], end[1], end[2], end[3], end[4], end[5]
+    x, y = states[n], reference[n]
+    s0, s1 = weights[4] * (x[VX] - y[0]) + slope[5, n - 1], slope[6, n - 1]
+    s2, s3 = weights[5] * (x[PSI] - y[1]), 0.0
+    s4, s5 = weights[6] * (x[X] - y[2]), weights[7] * (x[Y] - y[3])
     ta = td = 0.0
     for i in range(n - 1, -1, -1):
-        e, g, gx, gu = records[i], gains[i], node_gradient[i], stage_gradient[i]
-        ma = gu[0] + gu[2] + ta
+        e, g = records[i], gains[i]
+        a, delta, along = inputs[i, 0], inputs[i, 1], slope[4, i]
+        ma = weights[8] * a + damping_a * (a - plan[i, 0]) + along + slope[0, i] + slope[2, i] + ta
         ma += e[20] * s0 + e[21] * s1 + e[22] * s2 + e[23] * s3 + e[24] * s4 + e[25] * s5
-        md = gu[1] + gu[3] + td
+        md = weights[9] * delta + damping_delta * (delta - plan[i, 1])
+        md += along * e[RATE_DELTA] + slope[1, i] + slope[3, i] + td
         md += e[26] * s0 + e[27] * s1 + e[28] * s2 + e[29] * s3 + e[30] * s4 + e[31] * s5
         ka, kd = g[16] * ma + g[17] * md, g[17] * ma + g[18] * md
         du[i, 0], du[i, 1] = ka, kd
-        ta, td = g[19] * ka - gu[2], g[20] * kd - gu[3]
+        ta, td = g[19] * ka - slope[2, i], g[20] * kd - slope[3, i]
+        if i == 0:
+            break
         f0 = e[0] * s0 + e[1] * s1 + e[2] * s2 + e[3] * s3 + e[4] * s4 + e[5] * s5
         f1 = e[6] * s0 + e[7] * s1 + e[8] * s2 + e[9] * s3 + e[10] * s4 + e[11] * s5
         f2 = s2 + e[HEADING_X] * s4 + e[HEADING_Y] * s5
         f3 = e[12] * s0 + e[13] * s1 + e[14] * s2 + e[15] * s3 + e[16] * s4 + e[17] * s5
-        s0 = f0 + gx[0] - g[0] * ma - g[6] * md
-        s1 = f1 + gx[1] - g[1] * ma - g[7] * md
-        s2 = f2 + gx[2] - g[2] * ma - g[8] * md
-        s3 = f3 + gx[3] - g[3] * ma - g[9] * md
-        s4 += gx[4] - g[4] * ma - g[10] * md
-        s5 += gx[5] - g[5] * ma - g[11] * md
+        x, y = states[i], reference[i]
+        s0 = f0 + weights[0] * (x[VX] - y[0]) + slope[5, i - 1] + along * e[RATE_VX]
+        s0 -= g[0] * ma + g[6] * md
+        s1 = f1 + slope[6, i - 1] + along * e[RATE_VY] - g[1] * ma - g[7] * md
+        s2 = f2 + weights[1] * (x[PSI] - y[1]) - g[2] * ma - g[8] * md
+        s3 = f3 + along * e[RATE_R] - g[3] * ma - g[9] * md
+        s4 += weights[2] * (x[X] - y[2]) - g[4] * ma - g[10] * md
+        s5 += weights[3] * (x[Y] - y[3]) - g[5] * ma - g[11] * md
     x0 = x1 = x2 = x3 = x4 = x5 = 0.0
     pa = pd = 0.0
     for k in range(6):

@@ -42,7 +42,7 @@ from lpv_track_env.bicycle import (
     compiled_inverse_speed,
 )
 from lpv_track_env.kernels import PREVIEW_START
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled, inlined
 
 Array = NDArray[Any]
 Float = Any
@@ -71,7 +71,7 @@ SHORTEST_STEP = 1e-6
 @compiled
 def space(n: int) -> int:
     """Length of the working space of `solve` for N = n."""
-    return workspace_size(n) + RECORD * n + SCRATCH + 12 * (n + 1) + 4 * n + 3 * n
+    return workspace_size(n) + RECORD * n + SCRATCH + 6 * (n + 1) + 4 * n + 3 * n
 
 
 @compiled
@@ -120,7 +120,7 @@ def _penalty(excess: Float, soft: int, limits: Array) -> Float:
     return slack * (limits[LINEAR + soft] + 0.5 * limits[QUADRATIC + soft] * slack)
 
 
-@compiled
+@inlined
 def solve(
     state: Array, last: Array, reference: Array, weights: Array, constants: Array, plan: Array,
     states: Array, told: Array, work: Array,
@@ -143,8 +143,6 @@ def solve(
     at += SCRATCH
     base = work[at : at + 6 * (n + 1)].reshape(n + 1, 6)
     at += 6 * (n + 1)
-    trial_states = work[at : at + 6 * (n + 1)].reshape(n + 1, 6)
-    at += 6 * (n + 1)
     inputs = work[at : at + 2 * n].reshape(n, 2)
     at += 2 * n
     trial = work[at : at + 2 * n].reshape(n, 2)
@@ -156,7 +154,6 @@ def solve(
     clamp(plan, last, limits)
     for k in range(6):
         base[0, k] = state[k]
-        trial_states[0, k] = state[k]
     iterations = int(constants[ITERATIONS])
     cost = math.inf
     for iteration in range(iterations):
@@ -175,19 +172,21 @@ def solve(
             for i in range(n):
                 plan[i, 0], plan[i, 1] = inputs[i, 0], inputs[i, 1]
             break
-        if iteration == 0:
-            cost = evaluate(base, plan, reference, weights, constants)
         largest = 0.0
         for i in range(n):
             largest = max(largest, abs(inputs[i, 0] - plan[i, 0]), abs(inputs[i, 1] - plan[i, 1]))
-        length, found = 1.0, math.inf
-        while length >= SHORTEST_STEP:
+        # Length 0 first, for the cost of the plan as it stands.
+        length, found = 0.0 if iteration == 0 else 1.0, math.inf
+        while True:
             for i in range(n):
                 trial[i, 0] = plan[i, 0] + length * (inputs[i, 0] - plan[i, 0])
                 trial[i, 1] = plan[i, 1] + length * (inputs[i, 1] - plan[i, 1])
-            roll_out(trial, constants, h, substeps, trial_states)
-            found = evaluate(trial_states, trial, reference, weights, constants)
-            if found <= cost:
+            roll_out(trial, constants, h, substeps, states)
+            found = evaluate(states, trial, reference, weights, constants)
+            if length == 0.0:
+                cost, length = found, 1.0
+                continue
+            if found <= cost or length < SHORTEST_STEP:
                 break
             length *= 0.5
         if found <= cost:
@@ -195,17 +194,14 @@ def solve(
             for i in range(n):
                 plan[i, 0], plan[i, 1] = trial[i, 0], trial[i, 1]
         if largest <= STEP_TOLERANCE or not found <= cost:
-            for i in range(n + 1):
-                for k in range(6):
-                    states[i, k] = trial_states[i, k]
             break
     for soft in range(3):
         for i in range(n):
             told[SLACK + soft] = max(told[SLACK + soft], slack[soft, i])
-    told[COST] = evaluate(states, plan, reference, weights, constants)
-    if not math.isfinite(told[COST]):
-        return _finish(told, NOT_FINITE)
-    return _finish(told, SUCCESS)
+    if iterations == 1:
+        cost = evaluate(states, plan, reference, weights, constants)
+    told[COST] = cost
+    return _finish(told, SUCCESS if math.isfinite(cost) else NOT_FINITE)
 
 
 @compiled
@@ -240,7 +236,7 @@ def situation(
     return True
 
 
-@compiled
+@inlined
 def control_row(
     observation: Array, weights: Array, constants: Array, plan: Array, flags: Array, told: Array,
     states: Array, action: Array, work: Array,
