@@ -68,15 +68,18 @@ def field(
     rolling_deceleration: Any,
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
     """Time derivative of [vx, vy, psi, r, X, Y]; `q` is the inverse speed, see the module."""
+    # Written for a short chain of operations: the inverse of the speed comes late, the inverses of
+    # mass and inertia once for all substeps (a compiler hoists them).
+    inverse_mass, inverse_inertia = 1.0 / mass, 1.0 / yaw_inertia
     direction = vx * q
-    force_front = caf * (delta * direction - (vy + lf * r) * q)
-    force_rear = car * ((lr * r - vy) * q)
+    force_front = (caf * q) * (delta * vx - (vy + lf * r))
+    force_rear = (car * q) * (lr * r - vy)
     lateral_front = force_front * cos_delta
     return (
-        a - rolling_deceleration * direction - force_front * sin_delta / mass + r * vy,
-        (force_rear + lateral_front) / mass - r * vx,
+        a - rolling_deceleration * direction - force_front * sin_delta * inverse_mass + r * vy,
+        (force_rear + lateral_front) * inverse_mass - r * vx,
         r,
-        (lateral_front * lf - force_rear * lr) / yaw_inertia,
+        (lateral_front * lf - force_rear * lr) * inverse_inertia,
         vx * cos_psi - vy * sin_psi,
         vx * sin_psi + vy * cos_psi,
     )
@@ -200,7 +203,20 @@ compiled_inverse_speed_polynomial = compiled(inverse_speed_polynomial)
 
 @compiled
 def compiled_inverse_speed(vx: float) -> float:
-    """q(vx) inside compiled kernels."""
+    """q(vx) inside compiled kernels, for a single vehicle: no polynomial where it is 1/|vx|."""
+    speed = abs(vx)
+    if speed >= LOW_SPEED:
+        return 1.0 / speed
+    value: float = compiled_inverse_speed_polynomial(speed / LOW_SPEED, LOW_SPEED)
+    return value
+
+
+@compiled
+def compiled_inverse_speed_of_lanes(vx: float) -> float:
+    """The same number, bit for bit, without a branch: for loops over vehicles side by side.
+
+    From LOW_SPEED on the polynomial is 8 / (8 |vx|), and a power of two does not round.
+    """
     speed = abs(vx)
     value: float = compiled_inverse_speed_polynomial(
         min(speed / LOW_SPEED, 1.0), max(speed, LOW_SPEED)

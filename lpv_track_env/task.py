@@ -16,6 +16,7 @@ from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
+from trajectories.projection import tightest_turn
 from trajectories.speed import constant_speed
 
 SPEED_MODES = ("variable", "fixed")
@@ -106,6 +107,7 @@ class Task:
     def constants(self) -> Array:
         """Numbers as the kernels take them, shape (CONSTANTS_SIZE,)."""
         car, period = self.vehicle, self.control_period
+        start_range = (0.0, 0.0, 0.0, 0.0)
         low, high = car.acceleration_range
         return np.concatenate(
             [
@@ -123,6 +125,8 @@ class Task:
                     self.max_steps,
                     self.path.length,
                     float(self.path.closed),
+                    tightest_turn(self.path.table, self.path.closed),
+                    *start_range,
                 ],
                 self.reward_weights.as_array(),
             ]
