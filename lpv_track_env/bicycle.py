@@ -68,18 +68,21 @@ def field(
     rolling_deceleration: Any,
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
     """Time derivative of [vx, vy, psi, r, X, Y]; `q` is the inverse speed, see the module."""
-    # Written for a short chain of operations: the inverse of the speed comes late, the inverses of
-    # mass and inertia once for all substeps (a compiler hoists them).
+    # Slips are axle velocities, slip angle times |vx|; q turns them into angles at the very end. So
+    # a stage of an integrator waits for one division, and what stays within a control period (the
+    # stiffnesses with the mass, the inertia and the steering angle) stands in front of each term.
+    slip_front = delta * vx - (vy + lf * r)
+    slip_rear = lr * r - vy
     inverse_mass, inverse_inertia = 1.0 / mass, 1.0 / yaw_inertia
-    direction = vx * q
-    force_front = (caf * q) * (delta * vx - (vy + lf * r))
-    force_rear = (car * q) * (lr * r - vy)
-    lateral_front = force_front * cos_delta
+    front, rear = caf * cos_delta, car
     return (
-        a - rolling_deceleration * direction - force_front * sin_delta * inverse_mass + r * vy,
-        (force_rear + lateral_front) * inverse_mass - r * vx,
+        a
+        - (rolling_deceleration * vx + (caf * sin_delta * inverse_mass) * slip_front) * q
+        + r * vy,
+        ((front * inverse_mass) * slip_front + (rear * inverse_mass) * slip_rear) * q - r * vx,
         r,
-        (lateral_front * lf - force_rear * lr) * inverse_inertia,
+        ((front * lf * inverse_inertia) * slip_front - (rear * lr * inverse_inertia) * slip_rear)
+        * q,
         vx * cos_psi - vy * sin_psi,
         vx * sin_psi + vy * cos_psi,
     )
