@@ -12,6 +12,8 @@ from lpv_track_env.registration import register
 _SUBMODULES = (
     "bicycle",
     "env",
+    "episodes",
+    "integration",
     "kernels",
     "lpv",
     "observation",

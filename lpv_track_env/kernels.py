@@ -97,7 +97,7 @@ def observe(
     memory: Array, constants: Array, table: Array, bound: Array, observation: Array,
     index: int, u: Any,
 ) -> None:  # fmt: skip
-    """Write the observation (see `observation`) of an episode whose foot point is in a cell at u."""
+    """Write the observation (see `observation`); the foot point is at u in [0, 1] of a cell."""
     k = (observation.shape[0] - PREVIEW_START) // 2
     observation[0] = saturate(memory[VX], bound[0])
     observation[1] = saturate(memory[VY], bound[1])

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trajectories
-from lpv_track_env import kernels
 from lpv_track_env.bicycle import fastest_pole
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import RewardWeights
@@ -84,11 +83,17 @@ class Task:
     reward_weights: RewardWeights
     max_lateral_error: float
     time_limit: float | None
+    initial_error_range: tuple[float, ...] = (0.0, 0.0, 0.0)
+    random_start: bool = False
 
     def __post_init__(self) -> None:
         checked_period(self.control_period)
         if not self.max_lateral_error > 0:
             raise ValueError(f"max_lateral_error must be positive, not {self.max_lateral_error} m")
+        if len(self.initial_error_range) != 3 or not all(
+            0.0 <= half < math.inf for half in self.initial_error_range
+        ):
+            raise ValueError("initial_error_range must be three numbers >= 0: m, rad, m/s")
         if self.time_limit is not None and not 0 < self.time_limit < math.inf:
             raise ValueError(f"time_limit must be positive and finite, not {self.time_limit} s")
 
@@ -104,10 +109,15 @@ class Task:
         limit = 1.5 * self.path.duration + 10.0 if self.time_limit is None else self.time_limit
         return math.ceil(limit / self.control_period - 1e-9)
 
+    @property
+    def start_range(self) -> float:
+        """Episodes start at arc lengths from 0 up to here, m; an open path leaves some to drive."""
+        share = 1.0 if self.path.closed else 0.8
+        return share * self.path.length if self.random_start else 0.0
+
     def constants(self) -> Array:
         """Numbers as the kernels take them, shape (CONSTANTS_SIZE,)."""
         car, period = self.vehicle, self.control_period
-        start_range = (0.0, 0.0, 0.0, 0.0)
         low, high = car.acceleration_range
         return np.concatenate(
             [
@@ -126,26 +136,9 @@ class Task:
                     self.path.length,
                     float(self.path.closed),
                     tightest_turn(self.path.table, self.path.closed),
-                    *start_range,
+                    self.start_range,
+                    *self.initial_error_range,
                 ],
                 self.reward_weights.as_array(),
             ]
         )
-
-    def initial_memory(self, arc_length: float, errors: tuple[float, float, float]) -> Array:
-        """Memory of an episode that begins at an arc length with errors in (e_y, e_psi, vx)."""
-        lateral_error, heading_error, speed_error = errors
-        at = self.path.sample(arc_length)
-        heading = float(at.heading)
-        memory = np.zeros(kernels.MEMORY_SIZE)
-        memory[:6] = (
-            float(at.speed) + speed_error,
-            0.0,
-            heading + heading_error,
-            0.0,
-            float(at.x) - lateral_error * math.sin(heading),
-            float(at.y) + lateral_error * math.cos(heading),
-        )
-        memory[kernels.ACCELERATION] = self.vehicle.rolling_deceleration
-        memory[kernels.ARC_LENGTH] = arc_length
-        return memory

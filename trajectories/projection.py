@@ -383,7 +383,9 @@ def fill_preview(
         offset = min(tau * (v0 + half), h)
         end = base + (index * h + offset)
         next_heading = turned + heading_in(table, h, index, offset * inverse)
-        out[first + k] = saturate((next_heading - heading) / max(end - start, 1e-9), curvature_bound)
+        out[first + k] = saturate(
+            (next_heading - heading) / max(end - start, 1e-9), curvature_bound
+        )
         out[first + count + k] = saturate(v0 + 2.0 * half, speed_bound)
         start, heading = end, next_heading
 
@@ -409,9 +411,7 @@ def preview(
     index, offset = cell(s, length, closed, table.shape[0])
     u = offset * (table.shape[0] - 1) / length
     values = np.empty(2 * count)
-    fill_preview(
-        table, length, closed, s, index, u, period, values, 0, count, math.inf, math.inf
-    )
+    fill_preview(table, length, closed, s, index, u, period, values, 0, count, math.inf, math.inf)
     curvature[:] = values[:count]
     speed[:] = values[count:]
 
