@@ -20,6 +20,9 @@ _SUBMODULES = (
     "rendering",
     "reward",
     "task",
+    "vector_env",
+    "vector_infos",
+    "vector_kernels",
     "vehicle",
 )
 

@@ -15,7 +15,7 @@ from lpv_track_env import episodes, kernels, vehicle
 from lpv_track_env.episodes import given_start, random_key
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import TERMS, RewardWeights
-from lpv_track_env.task import CONDITIONS, Task, checked_period, choose, reference
+from lpv_track_env.task import CONDITIONS, Task, action_space, checked_period, choose, reference
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 
@@ -159,11 +159,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.metadata = {**self.metadata, "render_fps": fps}
         self._bound = self.base_task.layout.bound
         self.observation_space = spaces.Box(-self._bound, self._bound, dtype=np.float32)
-        low, high = car.acceleration_range
-        limit = car.max_steering_angle
-        self.action_space = spaces.Box(
-            np.array([low, -limit], dtype=np.float32), np.array([high, limit], dtype=np.float32)
-        )
+        self.action_space = action_space([car])
         self._observation = np.zeros(self.base_task.layout.size, dtype=np.float32)
         self._memory = np.zeros(kernels.MEMORY_SIZE)
         self._action = np.zeros(2)
@@ -324,6 +320,14 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer = Renderer(render_mode, self.metadata["render_fps"])
             self._renderer.begin(self.task)
         return self._renderer
+
+    def draw(self, task: Task, memory: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Draw an episode that is not this environment's own: a frame (600, 900, 3) uint8."""
+        renderer = self._open_renderer("rgb_array")
+        renderer.begin(task)
+        frame = renderer.draw(memory)
+        assert frame is not None
+        return frame
 
     def show_plan(self, plan: NDArray[np.float64] | None) -> None:
         """Give the renderer an agent's predicted positions, (n, 2) m, to draw in the next frame."""

@@ -3,10 +3,12 @@
 import difflib
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 import trajectories
@@ -67,6 +69,15 @@ def reference(
         noted = [*path.metadata.get("warnings", []), message]
         path = path.with_speed(np.minimum(path.speed, fastest), warnings=noted)
     return path
+
+
+def action_space(vehicles: Sequence[VehicleParameters]) -> spaces.Box:
+    """Box of [a m/s^2, delta rad], float32, that every vehicle's range of actions fits in."""
+    lows = [(car.acceleration_range[0], -car.max_steering_angle) for car in vehicles]
+    highs = [(car.acceleration_range[1], car.max_steering_angle) for car in vehicles]
+    return spaces.Box(
+        np.min(lows, axis=0).astype(np.float32), np.max(highs, axis=0).astype(np.float32)
+    )
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,19 @@ def compiled(function: Function) -> Function:
 
     Where no cache folder is writable it warns once and compiles in every process.
     """
-    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
+    return _compile(function)
+
+
+def compiled_parallel(function: Function) -> Function:
+    """`compiled`, its `numba.prange` loops over threads: for loops that call one ordinary function.
+
+    (A body that numba inlines into such a loop was seen to give wrong results.)
+    """
+    return _compile(function, parallel=True)
+
+
+def _compile(function: Function, **more: bool) -> Function:
+    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False, **more}
     try:
         dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:
