@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.episodes import TRAJECTORY_DRAW, VEHICLE_DRAW, begin, choice
-from lpv_track_env.integration import integrate, rotate, runge_kutta
+from lpv_track_env.integration import integrate, per_mass, rotate, runge_kutta
 from trajectories.compilation import compiled, compiled_parallel
 
 Array = NDArray[Any]
@@ -27,8 +27,8 @@ LANES = 32
 COS, SIN, ACCELERATION, STEERING, COS_STEERING, SIN_STEERING, PARAMETERS = (
     6 * LANES, 7 * LANES, 8 * LANES, 9 * LANES, 10 * LANES, 11 * LANES, 12 * LANES,
 )  # fmt: skip
-SUBSTEP, CLIPPED = 19 * LANES, 20 * LANES
-SCRATCH_SIZE = 21 * LANES
+SUBSTEP, CLIPPED = 18 * LANES, 19 * LANES
+SCRATCH_SIZE = 20 * LANES
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)
 """When an environment that has ended is reset, as `gymnasium.vector.AutoresetMode` says."""
@@ -44,7 +44,7 @@ def integrate_lanes(b: Array, substeps: int) -> None:
                 b[ACCELERATION + j], b[STEERING + j], b[COS_STEERING + j], b[SIN_STEERING + j],
                 b[PARAMETERS + j], b[PARAMETERS + LANES + j], b[PARAMETERS + 2 * LANES + j],
                 b[PARAMETERS + 3 * LANES + j], b[PARAMETERS + 4 * LANES + j],
-                b[PARAMETERS + 5 * LANES + j], b[PARAMETERS + 6 * LANES + j],
+                b[PARAMETERS + 5 * LANES + j],
                 b[SUBSTEP + j], True,
             )  # fmt: skip
             c, s = rotate(b[COS + j], b[SIN + j], turn)
@@ -68,8 +68,10 @@ def load_lane(b: Array, j: int, memory: Array, action: Array, p: Array) -> int:
     b[COS + j], b[SIN + j] = math.cos(memory[PSI]), math.sin(memory[PSI])
     b[ACCELERATION + j], b[STEERING + j] = a, delta
     b[COS_STEERING + j], b[SIN_STEERING + j] = math.cos(delta), math.sin(delta)
-    for row in range(7):
-        b[PARAMETERS + row * LANES + j] = p[row]
+    inertia, front, rear = per_mass(p[0], p[1], p[4], p[5])
+    b[PARAMETERS + j], b[PARAMETERS + LANES + j] = inertia, p[2]
+    b[PARAMETERS + 2 * LANES + j], b[PARAMETERS + 3 * LANES + j] = p[3], front
+    b[PARAMETERS + 4 * LANES + j], b[PARAMETERS + 5 * LANES + j] = rear, p[6]
     substeps = int(p[k.SUBSTEPS])
     b[SUBSTEP + j] = p[k.PERIOD] / substeps
     b[CLIPPED + j] = bits
@@ -77,14 +79,13 @@ def load_lane(b: Array, j: int, memory: Array, action: Array, p: Array) -> int:
 
 
 @compiled
-def integrate_one(b: Array, j: int, substeps: int) -> None:
+def integrate_one(b: Array, j: int, memory: Array, p: Array) -> None:
     """Integrate lane j alone: for blocks whose vehicles need different numbers of substeps."""
-    p = PARAMETERS + j
+    substeps = int(p[k.SUBSTEPS])
     vx, vy, psi, r, x, y = integrate(
-        b[j], b[LANES + j], b[2 * LANES + j], b[3 * LANES + j], b[4 * LANES + j],
-        b[5 * LANES + j], b[ACCELERATION + j], b[STEERING + j],
-        b[p], b[p + LANES], b[p + 2 * LANES], b[p + 3 * LANES], b[p + 4 * LANES],
-        b[p + 5 * LANES], b[p + 6 * LANES], b[SUBSTEP + j], substeps,
+        memory[VX], memory[VY], memory[PSI], memory[YAW_RATE], memory[X], memory[Y],
+        b[ACCELERATION + j], b[STEERING + j],
+        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[k.PERIOD] / substeps, substeps,
     )  # fmt: skip
     b[j], b[LANES + j], b[2 * LANES + j] = vx, vy, psi
     b[3 * LANES + j], b[4 * LANES + j], b[5 * LANES + j] = r, x, y
@@ -139,7 +140,7 @@ def advance(
             integrate_lanes(b, counts[0])
         else:
             for j in range(lanes):
-                integrate_one(b, j, counts[j])
+                integrate_one(b, j, memories[low + j], constants[cases[low + j]])
         for j in range(lanes):
             i = low + j
             memory, observation = memories[i], observations[i]

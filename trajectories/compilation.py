@@ -45,6 +45,11 @@ def compiled(function: Function) -> Function:
     return _compile(function)
 
 
+def compiled_inline(function: Function) -> Function:
+    """`compiled`, and always inlined by LLVM: for the body of a loop that is to be vectorised."""
+    return _compile(function, forceinline=True)
+
+
 def compiled_parallel(function: Function) -> Function:
     """`compiled`, its `numba.prange` loops over threads: for loops that call one ordinary function.
 
