@@ -39,7 +39,8 @@ def runge_kutta(
     """One Runge-Kutta step (classic, order 4) of h seconds, inputs held.
 
     (c, s) and (cd, sd) are cosine and sine of heading and steering angle; p1 to p6 the vehicle's
-    parameters from the yaw inertia on, per unit of mass (see `per_mass`). Returns the new vx, vy and r, and the changes of psi, X and Y.
+    parameters from the yaw inertia on, per unit of mass (see `per_mass`). Returns the new vx, vy
+    and r, and the changes of psi, X and Y.
     """
     half = 0.5 * h
     q = inverse_speed(vx, lanes)

@@ -71,13 +71,13 @@ def reference(
     return path
 
 
-def action_space(vehicles: Sequence[VehicleParameters]) -> spaces.Box:
+def action_space(vehicles: Sequence[VehicleParameters]) -> spaces.Space[NDArray[np.float32]]:
     """Box of [a m/s^2, delta rad], float32, that every vehicle's range of actions fits in."""
     lows = [(car.acceleration_range[0], -car.max_steering_angle) for car in vehicles]
     highs = [(car.acceleration_range[1], car.max_steering_angle) for car in vehicles]
-    return spaces.Box(
-        np.min(lows, axis=0).astype(np.float32), np.max(highs, axis=0).astype(np.float32)
-    )
+    low: NDArray[np.float32] = np.min(lows, axis=0).astype(np.float32)
+    high: NDArray[np.float32] = np.max(highs, axis=0).astype(np.float32)
+    return spaces.Box(low, high, dtype=np.float32)
 
 
 @dataclass(frozen=True)

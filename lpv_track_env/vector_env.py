@@ -4,12 +4,11 @@ import operator
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import gymnasium
 import numba
 import numpy as np
-from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -26,7 +25,6 @@ from trajectories import ReferencePath
 
 Array = NDArray[Any]
 Infos = dict[str, Any]
-Item = TypeVar("Item")
 
 MODES = {
     AutoresetMode.NEXT_STEP: vector_kernels.NEXT_STEP,
@@ -119,7 +117,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
         if render_mode is not None:
             choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
-        paths, cars = _listed("trajectory", trajectory), _listed("vehicle", vehicle)
+        paths: list[str | Path | ReferencePath] = _listed("trajectory", trajectory)
+        cars: list[str | Path | VehicleParameters] = _listed("vehicle", vehicle)
         self.num_envs = operator.index(num_envs)
         self.render_mode = render_mode
         self._single = PathTrackingEnv(
@@ -178,7 +177,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
 
     def task_of(self, index: int) -> Task:
         """Task of the current episode of environment `index`: its path, its vehicle."""
-        return self._packed[self._cases[index]]
+        return self._packed[int(self._cases[index])]
 
     @property
     def state(self) -> Array:
@@ -222,7 +221,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         return self._observations.copy(), episode_infos(self._memories, mask)
 
     def _pack_beside(self, extra: list[Task], mask: Array) -> None:
-        """Pack the constructor's tasks, `extra` ones, and those that unmarked episodes still use."""
+        """Pack the constructor's tasks, `extra` ones, and what unmarked episodes still use."""
         fixed = len(self.tasks)
         used = sorted({case for case in self._cases[~mask].tolist() if case >= fixed})
         if not extra and len(self._packed) == fixed + len(used):
@@ -345,12 +344,13 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._single.close()
 
 
-def _listed(kind: str, value: Item | Sequence[Item]) -> list[Item]:
-    if isinstance(value, list | tuple):
-        if not value:
-            raise ValueError(f"{kind}: an empty sequence")
-        return list(value)
-    return [value]  # type: ignore[list-item]  # str and Path are no sequences of items here
+def _listed(kind: str, value: Any) -> list[Any]:
+    """Items of a sequence, or the one item; a str is an item."""
+    if not isinstance(value, list | tuple):
+        return [value]
+    if not value:
+        raise ValueError(f"{kind}: an empty sequence")
+    return list(value)
 
 
 def _checked_mode(value: AutoresetMode | str) -> AutoresetMode:
@@ -362,7 +362,7 @@ def _checked_mode(value: AutoresetMode | str) -> AutoresetMode:
 
 def _checked_threads(value: int) -> int:
     threads = operator.index(value)
-    most = numba.config.NUMBA_NUM_THREADS
+    most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
     if not 1 <= threads <= most:
         raise ValueError(
             f"threads must be from 1 to {most} (the processors numba sees; NUMBA_NUM_THREADS sets "

@@ -20,7 +20,7 @@ SEARCH_WINDOW = 3.0
 """m: projection looks this far around the last arc length, so it stays on the local branch."""
 NEWTON_STEPS = 8
 """At most; two or three are the rule."""
-NEWTON_TOLERANCE = 1e-9
+NEWTON_TOLERANCE = 1e-6
 """Of a cell: Newton's method stops after a step below it."""
 FAR = 1.0e300
 
@@ -375,7 +375,8 @@ def fill_preview(
                 out[first + count + k] = saturate(last_speed, speed_bound)
                 start, heading = end, next_heading
                 continue
-        while index < n - 2 and table[index + 1, TIME] <= time:
+        # No need to look for the end: the last node's time is beyond `time`.
+        while table[index + 1, TIME] <= time:
             index += 1
         v0, v1 = table[index, SPEED], table[index + 1, SPEED]
         tau = max(time - table[index, TIME], 0.0)
