@@ -180,6 +180,15 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         return self._packed[int(self._cases[index])]
 
     @property
+    def memories(self) -> Array:
+        """Memories of the current episodes, (n, `kernels.MEMORY_SIZE`), to read."""
+        return self._memories
+
+    def final_of(self, index: int) -> tuple[Array, Array]:
+        """Last memory and observation of environment `index`, which just ended in SAME_STEP."""
+        return self._final_memories[index].copy(), self._final_observations[index].copy()
+
+    @property
     def state(self) -> Array:
         """True states [vx, vy, psi, r, X, Y], (n, 6), a copy."""
         return self._memories[:, :6].copy()
@@ -256,23 +265,20 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._check_order(waiting)
         commands = self._checked_actions(actions, waiting)
         n = self.num_envs
-        observations = np.empty_like(self._observations)
         rewards = np.empty(n)
         arguments = (
             self._mode, self._memories, commands, self._cases, self._drawn, self._constants,
             self._tables, self._rows, self._bound, self._keys, self._episodes, self._nothing_given,
-            observations, self._ends, rewards, self._final_memories, self._final_observations,
+            self._observations, self._ends, rewards, self._final_memories, self._final_observations,
         )  # fmt: skip
         if self._threads == 1:
             vector_kernels.advance(0, n, *arguments)
         else:
             _in_threads(self._threads, n, arguments)
-        if self.autoreset_mode is AutoresetMode.DISABLED:
-            # A reset of some environments hands out the others' observations again.
-            self._observations[:] = observations
         ended = self._ends != kernels.RUNNING
         truncated = self._ends == kernels.TIME_LIMIT
-        return observations, rewards, ended & ~truncated, truncated
+        # A copy: a reset of some environments hands out the others' observations again.
+        return self._observations.copy(), rewards, ended & ~truncated, truncated
 
     def _check_order(self, waiting: Array) -> None:
         if self._episodes.min() < 0:

@@ -62,3 +62,17 @@ def final_infos(memories: Array, observations: Array, ended: Array) -> Infos:
         "final_info": episode_infos(memories, ended),
         "_final_info": ended,
     }
+
+
+def single_info(memory: Array) -> Infos:
+    """Info of one episode without its end, as `PathTrackingEnv` gives it, from its memory."""
+    values = memory.tolist()
+    return {
+        "lateral_error": values[kernels.LATERAL_ERROR],
+        "heading_error": values[kernels.HEADING_ERROR],
+        "speed_error": values[kernels.SPEED_ERROR],
+        "arc_length": values[kernels.ARC_LENGTH],
+        "state": memory[:6].copy(),
+        "reward_terms": dict(zip(TERMS, values[kernels.TERMS :], strict=True)),
+        "clipped": int(values[kernels.CLIPPED]),
+    }
