@@ -12,12 +12,17 @@ from lpv_track_env.registration import register
 _SUBMODULES = (
     "bicycle",
     "env",
+    "episodes",
+    "integration",
     "kernels",
     "lpv",
     "observation",
     "rendering",
     "reward",
     "task",
+    "vector_env",
+    "vector_infos",
+    "vector_kernels",
     "vehicle",
 )
 

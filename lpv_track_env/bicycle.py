@@ -68,17 +68,21 @@ def field(
     rolling_deceleration: Any,
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
     """Time derivative of [vx, vy, psi, r, X, Y]; `q` is the inverse speed, see the module."""
-    direction = vx * q
-    force_front = caf * (delta * direction - (vy + lf * r) * q)
-    force_rear = car * ((lr * r - vy) * q)
-    lateral_front = force_front * cos_delta
-    # Divisions are slow: these two leave a compiled loop.
-    per_mass, per_inertia = 1.0 / mass, 1.0 / yaw_inertia
+    # Slips are axle velocities, slip angle times |vx|; q turns them into angles at the very end. So
+    # a stage of an integrator waits for one division, and what stays within a control period (the
+    # stiffnesses with the mass, the inertia and the steering angle) stands in front of each term.
+    slip_front = delta * vx - (vy + lf * r)
+    slip_rear = lr * r - vy
+    inverse_mass, inverse_inertia = 1.0 / mass, 1.0 / yaw_inertia
+    front, rear = caf * cos_delta, car
     return (
-        a - rolling_deceleration * direction - force_front * sin_delta * per_mass + r * vy,
-        (force_rear + lateral_front) * per_mass - r * vx,
+        a
+        - (rolling_deceleration * vx + (caf * sin_delta * inverse_mass) * slip_front) * q
+        + r * vy,
+        ((front * inverse_mass) * slip_front + (rear * inverse_mass) * slip_rear) * q - r * vx,
         r,
-        (lateral_front * lf - force_rear * lr) * per_inertia,
+        ((front * lf * inverse_inertia) * slip_front - (rear * lr * inverse_inertia) * slip_rear)
+        * q,
         vx * cos_psi - vy * sin_psi,
         vx * sin_psi + vy * cos_psi,
     )
@@ -257,7 +261,20 @@ compiled_inverse_speed_slope_polynomial = compiled(inverse_speed_slope_polynomia
 
 @compiled
 def compiled_inverse_speed(vx: float) -> float:
-    """q(vx) inside compiled kernels."""
+    """q(vx) inside compiled kernels, for a single vehicle: no polynomial where it is 1/|vx|."""
+    speed = abs(vx)
+    if speed >= LOW_SPEED:
+        return 1.0 / speed
+    value: float = compiled_inverse_speed_polynomial(speed / LOW_SPEED, LOW_SPEED)
+    return value
+
+
+@compiled
+def compiled_inverse_speed_of_lanes(vx: float) -> float:
+    """The same number, bit for bit, without a branch: for loops over vehicles side by side.
+
+    From LOW_SPEED on the polynomial is 8 / (8 |vx|), and a power of two does not round.
+    """
     speed = abs(vx)
     value: float = compiled_inverse_speed_polynomial(
         min(speed / LOW_SPEED, 1.0), max(speed, LOW_SPEED)

@@ -11,24 +11,18 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lpv_track_env import kernels, vehicle
+from lpv_track_env import episodes, kernels, vehicle
+from lpv_track_env.episodes import given_start, random_key
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import TERMS, RewardWeights
-from lpv_track_env.task import CONDITIONS, Task, checked_period, choose, reference
+from lpv_track_env.task import CONDITIONS, Task, action_space, checked_period, choose, reference
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 
 if TYPE_CHECKING:
     from lpv_track_env.rendering import Renderer
 
-RESET_OPTIONS = (
-    "trajectory",
-    "vehicle",
-    "arc_length",
-    "lateral_error",
-    "heading_error",
-    "speed_error",
-)
+RESET_OPTIONS = ("trajectory", "vehicle", *episodes.GIVEN)
 NUMBERS = (float, int)
 
 
@@ -77,7 +71,9 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     On the path at its start, at the reference speed, steering straight. `initial_error_range` draws
     uniform errors in lateral offset (m), heading (rad) and speed (m/s); `random_start` draws the
-    arc length too. All randomness comes from `self.np_random`.
+    arc length too. `reset(seed=...)` seeds `self.np_random` and takes one key from it; the episodes
+    that follow draw from key and number of the episode, see `lpv_track_env.episodes`. So
+    environment i of a `PathTrackingVectorEnv` reset with seed s is this one reset with s + i.
 
     `reset(options=...)` takes `trajectory`, `vehicle` (both as in the arguments), `arc_length` (m),
     `lateral_error` (m), `heading_error` (rad), `speed_error` (m/s); these hold for the episode
@@ -144,12 +140,6 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.conditions = choose("conditions", conditions, CONDITIONS)
         self.render_mode = render_mode
         self._speed = (speed_mode, fixed_speed)
-        self._initial_error_range = tuple(float(value) for value in initial_error_range)
-        if len(self._initial_error_range) != 3 or not all(
-            0.0 <= half < math.inf for half in self._initial_error_range
-        ):
-            raise ValueError("initial_error_range must be three numbers >= 0: m, rad, m/s")
-        self._random_start = random_start
         car = _load_vehicle(vehicle)
         period = checked_period(control_period)
         self.base_task = Task(
@@ -162,24 +152,25 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             reward_weights=reward_weights or RewardWeights(),
             max_lateral_error=float(max_lateral_error),
             time_limit=time_limit,
+            initial_error_range=tuple(float(half) for half in initial_error_range),
+            random_start=random_start,
         )
         fps = max(round(1.0 / self.base_task.control_period), 1)
         self.metadata = {**self.metadata, "render_fps": fps}
         self._bound = self.base_task.layout.bound
         self.observation_space = spaces.Box(-self._bound, self._bound, dtype=np.float32)
-        low, high = car.acceleration_range
-        limit = car.max_steering_angle
-        self.action_space = spaces.Box(
-            np.array([low, -limit], dtype=np.float32), np.array([high, limit], dtype=np.float32)
-        )
+        self.action_space = action_space([car])
         self._observation = np.zeros(self.base_task.layout.size, dtype=np.float32)
         self._memory = np.zeros(kernels.MEMORY_SIZE)
         self._action = np.zeros(2)
         self._running = False
+        self._key, self._episode = np.uint64(0), -1
         self._renderer: Renderer | None = None
         self._use(self.base_task)
 
     def _use(self, task: Task) -> None:
+        if getattr(self, "task", None) is task:
+            return
         self.task = task
         self._constants = task.constants()
         self._table = task.path.table
@@ -213,30 +204,19 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin an episode; see the class for `options`."""
-        super().reset(seed=seed)
         options = dict(options or {})
         for key in options:
             choose("reset option", key, RESET_OPTIONS)
-        task = self._episode_task(options)
-        length = task.path.length
-        if self._random_start:
-            share = 1.0 if task.path.closed else 0.8
-            arc_length = float(self.np_random.uniform(0.0, share * length))
-        else:
-            arc_length = 0.0
-        errors = [
-            float(self.np_random.uniform(-half, half)) if half > 0 else 0.0
-            for half in self._initial_error_range
-        ]
-        arc_length = _number(options, "arc_length", arc_length)
-        if not 0.0 <= arc_length <= length:
-            raise ValueError(f"option arc_length must be in [0, {length:.2f}] m, not {arc_length}")
-        for k, key in enumerate(("lateral_error", "heading_error", "speed_error")):
-            errors[k] = _number(options, key, errors[k])
+        task = self.episode_task(options)
+        given = given_start(options, task.path.length)
         # All is checked: from here on the last episode is gone.
+        super().reset(seed=seed)
+        self._count_episode(reseeded=seed is not None)
         self._use(task)
-        self._memory[:] = task.initial_memory(arc_length, (errors[0], errors[1], errors[2]))
-        kernels.start(self._memory, self._constants, self._table, self._bound, self._observation)
+        episodes.begin(
+            self._memory, self._constants, self._table, self._bound, self._observation,
+            self._key, self._episode, given,
+        )  # fmt: skip
         self._running = True
         if self._renderer is not None:
             self._renderer.begin(task)
@@ -244,7 +224,16 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self.render()
         return self._observation.copy(), self._info()
 
-    def _episode_task(self, options: Mapping[str, Any]) -> Task:
+    def _count_episode(self, *, reseeded: bool) -> None:
+        """Take a new key from `np_random` if it was seeded, else go on to the next episode."""
+        if reseeded or self._episode < 0:
+            self._key = random_key(self.np_random)
+            self._episode = 0
+        else:
+            self._episode += 1
+
+    def episode_task(self, options: Mapping[str, Any]) -> Task:
+        """Task of an episode with reset options `trajectory` and `vehicle`, if given."""
         if not {"trajectory", "vehicle"} & set(options):
             return self.base_task
         car = _load_vehicle(options.get("vehicle", self.base_task.vehicle))
@@ -332,6 +321,14 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer.begin(self.task)
         return self._renderer
 
+    def draw(self, task: Task, memory: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Draw an episode that is not this environment's own: a frame (600, 900, 3) uint8."""
+        renderer = self._open_renderer("rgb_array")
+        renderer.begin(task)
+        frame = renderer.draw(memory)
+        assert frame is not None
+        return frame
+
     def show_plan(self, plan: NDArray[np.float64] | None) -> None:
         """Give the renderer an agent's predicted positions, (n, 2) m, to draw in the next frame."""
         if self.render_mode is not None:
@@ -349,14 +346,3 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 def _load_vehicle(value: str | Path | VehicleParameters) -> VehicleParameters:
     return vehicle.load(value)
-
-
-def _number(options: Mapping[str, Any], key: str, default: float) -> float:
-    given = options.get(key, default)
-    try:
-        value = float(given)
-    except (TypeError, ValueError):
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"reset option {key} must be a finite number, not {given!r}")
-    return value

@@ -13,4 +13,8 @@ PATH_TRACKING = "lpv_track_env/PathTracking-v0"
 def register() -> None:
     """Register every id, once."""
     if PATH_TRACKING not in gymnasium.registry:
-        gymnasium.register(id=PATH_TRACKING, entry_point="lpv_track_env.env:PathTrackingEnv")
+        gymnasium.register(
+            id=PATH_TRACKING,
+            entry_point="lpv_track_env.env:PathTrackingEnv",
+            vector_entry_point="lpv_track_env.vector_env:PathTrackingVectorEnv",
+        )

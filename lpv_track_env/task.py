@@ -3,19 +3,21 @@
 import difflib
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 import trajectories
-from lpv_track_env import kernels
 from lpv_track_env.bicycle import fastest_pole
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
+from trajectories.projection import tightest_turn
 from trajectories.speed import constant_speed
 
 SPEED_MODES = ("variable", "fixed")
@@ -69,6 +71,15 @@ def reference(
     return path
 
 
+def action_space(vehicles: Sequence[VehicleParameters]) -> spaces.Space[NDArray[np.float32]]:
+    """Box of [a m/s^2, delta rad], float32, that every vehicle's range of actions fits in."""
+    lows = [(car.acceleration_range[0], -car.max_steering_angle) for car in vehicles]
+    highs = [(car.acceleration_range[1], car.max_steering_angle) for car in vehicles]
+    low: NDArray[np.float32] = np.min(lows, axis=0).astype(np.float32)
+    high: NDArray[np.float32] = np.max(highs, axis=0).astype(np.float32)
+    return spaces.Box(low, high, dtype=np.float32)
+
+
 @dataclass(frozen=True)
 class Task:
     """Settings of path tracking, shared by every environment on these kernels.
@@ -83,11 +94,17 @@ class Task:
     reward_weights: RewardWeights
     max_lateral_error: float
     time_limit: float | None
+    initial_error_range: tuple[float, ...] = (0.0, 0.0, 0.0)
+    random_start: bool = False
 
     def __post_init__(self) -> None:
         checked_period(self.control_period)
         if not self.max_lateral_error > 0:
             raise ValueError(f"max_lateral_error must be positive, not {self.max_lateral_error} m")
+        if len(self.initial_error_range) != 3 or not all(
+            0.0 <= half < math.inf for half in self.initial_error_range
+        ):
+            raise ValueError("initial_error_range must be three numbers >= 0: m, rad, m/s")
         if self.time_limit is not None and not 0 < self.time_limit < math.inf:
             raise ValueError(f"time_limit must be positive and finite, not {self.time_limit} s")
 
@@ -102,6 +119,12 @@ class Task:
         """Control periods until truncation; by default one and a half times the path's duration."""
         limit = 1.5 * self.path.duration + 10.0 if self.time_limit is None else self.time_limit
         return math.ceil(limit / self.control_period - 1e-9)
+
+    @property
+    def start_range(self) -> float:
+        """Episodes start at arc lengths from 0 up to here, m; an open path leaves some to drive."""
+        share = 1.0 if self.path.closed else 0.8
+        return share * self.path.length if self.random_start else 0.0
 
     def constants(self) -> Array:
         """Numbers as the kernels take them, shape (CONSTANTS_SIZE,)."""
@@ -123,25 +146,10 @@ class Task:
                     self.max_steps,
                     self.path.length,
                     float(self.path.closed),
+                    tightest_turn(self.path.table, self.path.closed),
+                    self.start_range,
+                    *self.initial_error_range,
                 ],
                 self.reward_weights.as_array(),
             ]
         )
-
-    def initial_memory(self, arc_length: float, errors: tuple[float, float, float]) -> Array:
-        """Memory of an episode that begins at an arc length with errors in (e_y, e_psi, vx)."""
-        lateral_error, heading_error, speed_error = errors
-        at = self.path.sample(arc_length)
-        heading = float(at.heading)
-        memory = np.zeros(kernels.MEMORY_SIZE)
-        memory[:6] = (
-            float(at.speed) + speed_error,
-            0.0,
-            heading + heading_error,
-            0.0,
-            float(at.x) - lateral_error * math.sin(heading),
-            float(at.y) + lateral_error * math.cos(heading),
-        )
-        memory[kernels.ACCELERATION] = self.vehicle.rolling_deceleration
-        memory[kernels.ARC_LENGTH] = arc_length
-        return memory

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lpv_track_env import kernels
+from lpv_track_env import integration, kernels
 from lpv_track_env.task import Task
 from lpv_track_env.vehicle import M2_MINIBUS
 
@@ -96,7 +96,7 @@ def test_rotation_agrees_with_libm() -> None:
     rng = np.random.default_rng(0)
     for angle in [0.0, *rng.uniform(-0.1, 0.1, 2000)]:
         psi = rng.uniform(-math.pi, math.pi)
-        c, s = kernels.rotate(math.cos(psi), math.sin(psi), float(angle))
+        c, s = integration.rotate(math.cos(psi), math.sin(psi), float(angle))
         bound = abs(angle) ** 8 / math.factorial(8) + abs(angle) ** 9 / math.factorial(9) + 5e-16
         assert math.hypot(c - math.cos(psi + angle), s - math.sin(psi + angle)) <= bound
 
@@ -163,7 +163,7 @@ def test_layout_of_memory_and_constants() -> None:
     task = Task(
         path=trajectories.load("circle"), vehicle=M2_MINIBUS, control_period=0.04,
         layout=ObservationLayout(7, 0.1), reward_weights=weights, max_lateral_error=3.0,
-        time_limit=12.0,
+        time_limit=12.0, initial_error_range=(0.1, 0.2, 0.3), random_start=True,
     )  # fmt: skip
     packed = task.constants()
     assert packed.shape == (kernels.CONSTANTS_SIZE,)
@@ -181,8 +181,14 @@ def test_layout_of_memory_and_constants() -> None:
         "MAX_STEPS": 300.0,
         "LENGTH": task.path.length,
         "CLOSED": 1.0,
+        "START_RANGE": task.path.length,
+        "LATERAL_RANGE": 0.1,
+        "HEADING_RANGE": 0.2,
+        "SPEED_RANGE": 0.3,
     }
     for name, value in wanted.items():
         assert packed[getattr(kernels, name)] == value, name
+    # Of a circle of 30 m: the chords' turn over their length comes a little above 1 / R.
+    assert packed[kernels.TIGHTEST] == pytest.approx(1.0 / 30.0, rel=1e-4)
     np.testing.assert_array_equal(packed[kernels.WEIGHTS :], weights.as_array())
     assert kernels.TERMS + len(TERMS) == kernels.MEMORY_SIZE

@@ -76,20 +76,33 @@ def compiled(function: Function) -> Function:
 
     Where no cache folder is writable it warns once and compiles in every process.
     """
-    return _compile(function, "never")
+    return _compile(function)
 
 
-def inlined(function: Function) -> Function:
-    """`compiled`, and put into its callers as it stands.
+def compiled_in_place(function: Function) -> Function:
+    """`compiled`, and put into its callers by numba, as it stands.
 
     For large functions with few callers: each level of calls between large functions is optimised
     all over again, which takes seconds. Not for functions called from parallel loops.
     """
-    return _compile(function, "always")
+    return _compile(function, inline="always")
 
 
-def _compile(function: Function, inline: str) -> Function:
-    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False, "inline": inline}
+def compiled_inline(function: Function) -> Function:
+    """`compiled`, and always inlined by LLVM: for the body of a loop that is to be vectorised."""
+    return _compile(function, forceinline=True)
+
+
+def compiled_parallel(function: Function) -> Function:
+    """`compiled`, its `numba.prange` loops over threads: for loops that call one ordinary function.
+
+    (A body that numba inlines into such a loop was seen to give wrong results.)
+    """
+    return _compile(function, parallel=True)
+
+
+def _compile(function: Function, **more: bool | str) -> Function:
+    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False, **more}
     try:
         dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:

@@ -29,7 +29,7 @@ from agents.nmpc import riccati
 from agents.nmpc.linearisation import RATE, RATE_DELTA, RATE_R, RATE_VX, RATE_VY
 from agents.nmpc.riccati import BARRIER, GAIN, SLOPE
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
-from trajectories.compilation import compiled, inlined
+from trajectories.compilation import compiled, compiled_in_place
 
 Array = NDArray[Any]
 Float = Any
@@ -305,7 +305,7 @@ def expand(
     return 1.0 / worst
 
 
-@inlined
+@compiled_in_place
 def solve_qp(
     records: Array, base_states: Array, plan: Array, last: Array, reference: Array, weights: Array,
     limits: Array, tolerance: Float, states: Array, inputs: Array, slack: Array, work: Array,

@@ -32,8 +32,8 @@ from lpv_track_env.bicycle import (
     compiled_inverse_speed_slope,
     compiled_jacobian,
 )
-from lpv_track_env.kernels import integrate, rotate
-from trajectories.compilation import compiled, inlined
+from lpv_track_env.integration import integrate, rotate
+from trajectories.compilation import compiled, compiled_in_place
 
 Array = NDArray[Any]
 # Floats inside compiled code; numba ignores annotations, mypy sees what a caller passes.
@@ -190,7 +190,7 @@ def roll_out(inputs: Array, p: Array, h: Float, n: int, states: Array) -> None:
         advance(states[i], inputs[i, 0], inputs[i, 1], p, h, n, states[i + 1])
 
 
-@inlined
+@compiled_in_place
 def differentiate_along(
     inputs: Array, p: Array, h: Float, n: int, states: Array, records: Array, scratch: Array
 ) -> None:

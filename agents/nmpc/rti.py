@@ -42,7 +42,7 @@ from lpv_track_env.bicycle import (
     compiled_inverse_speed,
 )
 from lpv_track_env.kernels import PREVIEW_START
-from trajectories.compilation import compiled, inlined
+from trajectories.compilation import compiled, compiled_in_place
 
 Array = NDArray[Any]
 Float = Any
@@ -120,7 +120,7 @@ def _penalty(excess: Float, soft: int, limits: Array) -> Float:
     return slack * (limits[LINEAR + soft] + 0.5 * limits[QUADRATIC + soft] * slack)
 
 
-@inlined
+@compiled_in_place
 def solve(
     state: Array, last: Array, reference: Array, weights: Array, constants: Array, plan: Array,
     states: Array, told: Array, work: Array,
@@ -236,7 +236,7 @@ def situation(
     return True
 
 
-@inlined
+@compiled_in_place
 def control_row(
     observation: Array, weights: Array, constants: Array, plan: Array, flags: Array, told: Array,
     states: Array, action: Array, work: Array,

@@ -1,0 +1,1 @@
+"""Speed: what the compiled environments are measured against."""

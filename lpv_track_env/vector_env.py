@@ -1,0 +1,389 @@
+"""Many path tracking environments stepped at once, in compiled code."""
+
+import operator
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numba
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from lpv_track_env import kernels, vector_kernels
+from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
+from lpv_track_env.episodes import GIVEN, given_start, random_key
+from lpv_track_env.reward import RewardWeights
+from lpv_track_env.task import Task, action_space, choose
+from lpv_track_env.vector_infos import episode_infos, final_infos
+from lpv_track_env.vehicle import VehicleParameters
+from trajectories import ReferencePath
+
+Array = NDArray[Any]
+Infos = dict[str, Any]
+
+MODES = {
+    AutoresetMode.NEXT_STEP: vector_kernels.NEXT_STEP,
+    AutoresetMode.SAME_STEP: vector_kernels.SAME_STEP,
+    AutoresetMode.DISABLED: vector_kernels.DISABLED,
+}
+ENTRIES = ("0 (acceleration)", "1 (steering angle)")
+
+
+class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
+    """`num_envs` vehicles follow reference paths: `PathTrackingEnv`, many at once.
+
+    `gymnasium.make_vec("lpv_track_env/PathTracking-v0", num_envs=n,
+    vectorization_mode="vector_entry_point", ...)` makes one. It behaves as Gymnasium's
+    `SyncVectorEnv` over single environments does, bit for bit, in a fraction of the time: actions
+    (n, 2), observations (n, size) and ends as in `PathTrackingEnv`, rewards (n,) float64.
+
+    ## Seeds
+
+    Environment i of `reset(seed=s)` is a single environment of `reset(seed=s + i)`, also over the
+    episodes that follow, whatever n is and in which order they end. A list gives each its own.
+
+    ## Autoreset
+
+    `metadata["autoreset_mode"]` says which of Gymnasium's modes holds:
+
+    | mode | an environment that has ended |
+    |---|---|
+    | `NEXT_STEP` | begins anew in the next step: its action is ignored, its reward 0 |
+    | `SAME_STEP` | begins anew at once; `infos["final_obs"]`, `infos["final_info"]` keep the end |
+    | `DISABLED` | waits for `reset(options={"reset_mask": mask})`, mask (n,) bool |
+
+    ## Infos
+
+    Those of the single environment as arrays over environments, `reward_terms` a dictionary of
+    them; each `key` with a mask `_key` of the environments that it holds for (masks of one call
+    may be one array). `end` only in steps in which an episode ended.
+
+    ## Errors
+
+    An action that is not finite, of a wrong shape or type, is a ValueError that names environment
+    and entry, and leaves all episodes untouched. A step before `reset`, or in mode `DISABLED` of an
+    environment that has ended, is a `gymnasium.error.ResetNeeded`.
+
+    ## Arguments
+
+    Those of `PathTrackingEnv` (rendering: "rgb_array" only, a frame an environment), and
+
+    num_envs
+        n, number of environments.
+    trajectory, vehicle
+        May be sequences too: every reset of an environment then draws one of each, uniformly. The
+        action space is the widest of the vehicles'; each vehicle's actuators clip to its own.
+    autoreset_mode
+        `gymnasium.vector.AutoresetMode` or its value.
+    threads
+        Threads of a step, 1 by default; more pay from some 1000 environments on. Results do not
+        depend on it.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012  declared so by gymnasium
+        "render_modes": ["rgb_array"],
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        trajectory: str | Path | ReferencePath | Sequence[str | Path | ReferencePath] = "T1",
+        vehicle: str | Path | VehicleParameters | Sequence[str | Path | VehicleParameters] = (
+            "m2-minibus"
+        ),
+        speed_mode: str = "variable",
+        fixed_speed: float | None = None,
+        conditions: str = "simulation",
+        control_period: float = 0.05,
+        render_mode: str | None = None,
+        *,
+        preview_steps: int = 20,
+        preview_period: float | None = None,
+        reward_weights: RewardWeights | None = None,
+        max_lateral_error: float = 5.0,
+        time_limit: float | None = None,
+        initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        random_start: bool = False,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        threads: int = 1,
+    ) -> None:
+        if operator.index(num_envs) < 1:
+            raise ValueError(f"num_envs must be at least 1, not {num_envs}")
+        if render_mode is not None:
+            choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
+        paths: list[str | Path | ReferencePath] = _listed("trajectory", trajectory)
+        cars: list[str | Path | VehicleParameters] = _listed("vehicle", vehicle)
+        self.num_envs = operator.index(num_envs)
+        self.render_mode = render_mode
+        self._single = PathTrackingEnv(
+            paths[0], cars[0], speed_mode, fixed_speed, conditions, control_period,
+            render_mode=render_mode, preview_steps=preview_steps, preview_period=preview_period,
+            reward_weights=reward_weights, max_lateral_error=max_lateral_error,
+            time_limit=time_limit, initial_error_range=initial_error_range,
+            random_start=random_start,
+        )  # fmt: skip
+        self.autoreset_mode = _checked_mode(autoreset_mode)
+        self._mode = MODES[self.autoreset_mode]
+        self.metadata = {**self._single.metadata, **self.metadata}
+        self.metadata["autoreset_mode"] = self.autoreset_mode
+        self._threads = _checked_threads(threads)
+        self._paths, self._cars = paths, cars
+        self._drawn = (0, len(paths), len(cars))
+        self.tasks = self._tasks_of(paths, cars)
+        self._pack(self.tasks)
+        self.single_observation_space = self._single.observation_space
+        self.single_action_space = action_space([task.vehicle for task in self.tasks])
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        n, size = self.num_envs, self._single.layout.size
+        self._bound = self._single.layout.bound
+        self._memories = np.zeros((n, kernels.MEMORY_SIZE))
+        self._final_memories = np.zeros((n, kernels.MEMORY_SIZE))
+        self._observations = np.zeros((n, size), dtype=np.float32)
+        self._final_observations = np.zeros((n, size), dtype=np.float32)
+        self._cases = np.zeros(n, dtype=np.int64)
+        self._keys = np.zeros(n, dtype=np.uint64)
+        self._episodes = np.full(n, -1)
+        self._ends = np.zeros(n, dtype=np.int64)
+        self._nothing_given = np.full(len(GIVEN), np.nan)
+
+    def _tasks_of(self, paths: Sequence[Any], cars: Sequence[Any]) -> list[Task]:
+        """Return the task of every combination, vehicles side by side."""
+        return [
+            self._single.episode_task({"trajectory": path, "vehicle": car})
+            for path in paths
+            for car in cars
+        ]
+
+    def _pack(self, tasks: list[Task]) -> None:
+        """Put the constants and the tables of all tasks into one array each."""
+        self._packed = tasks
+        self._constants = np.stack([task.constants() for task in tasks])
+        tables = [tasks[0].path.table]
+        rows, first = [(0, len(tables[0]))], 0
+        for task in tasks[1:]:
+            # Vehicles mostly share a path's table, and they stand beside one another in the list.
+            if not np.array_equal(task.path.table, tables[-1]):
+                first += len(tables[-1])
+                tables.append(task.path.table)
+            rows.append((first, first + len(tables[-1])))
+        self._tables, self._rows = np.concatenate(tables), np.array(rows)
+
+    def task_of(self, index: int) -> Task:
+        """Task of the current episode of environment `index`: its path, its vehicle."""
+        return self._packed[int(self._cases[index])]
+
+    @property
+    def memories(self) -> Array:
+        """Memories of the current episodes, (n, `kernels.MEMORY_SIZE`), to read."""
+        return self._memories
+
+    def final_of(self, index: int) -> tuple[Array, Array]:
+        """Last memory and observation of environment `index`, which just ended in SAME_STEP."""
+        return self._final_memories[index].copy(), self._final_observations[index].copy()
+
+    @property
+    def state(self) -> Array:
+        """True states [vx, vy, psi, r, X, Y], (n, 6), a copy."""
+        return self._memories[:, :6].copy()
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Infos | None = None
+    ) -> tuple[Array, Infos]:
+        """Begin episodes: of all environments, or of those that `options["reset_mask"]` marks.
+
+        The other options are those of `PathTrackingEnv` and hold for every episode that begins.
+
+        Raises
+        ------
+        ValueError, TypeError
+            For an unknown or impossible option, a mask of a wrong shape or type, or seeds that are
+            not one for each environment. Nothing is changed then.
+        """
+        options = dict(options or {})
+        mask = self._checked_mask(options.pop("reset_mask", None))
+        for key in options:
+            choose("reset option", key, RESET_OPTIONS)
+        seeds = self._checked_seeds(seed)
+        drawn, tasks = self._drawn, self.tasks
+        if {"trajectory", "vehicle"} & set(options):
+            paths = [options["trajectory"]] if "trajectory" in options else self._paths
+            cars = [options["vehicle"]] if "vehicle" in options else self._cars
+            tasks = self._tasks_of(paths, cars)
+            drawn = (len(self.tasks), len(paths), len(cars))
+        given = given_start(options, min(task.path.length for task in tasks))
+        # All is checked: from here on the last episodes are gone.
+        if isinstance(seed, int):
+            super().reset(seed=seed)
+        self._take_keys(seeds, mask)
+        self._pack_beside(tasks if tasks is not self.tasks else [], mask)
+        vector_kernels.begin_all(
+            mask, self._memories, self._cases, drawn, self._constants, self._tables, self._rows,
+            self._bound, self._keys, self._episodes, given, self._observations, self._ends,
+        )  # fmt: skip
+        return self._observations.copy(), episode_infos(self._memories, mask)
+
+    def _pack_beside(self, extra: list[Task], mask: Array) -> None:
+        """Pack the constructor's tasks, `extra` ones, and what unmarked episodes still use."""
+        fixed = len(self.tasks)
+        used = sorted({case for case in self._cases[~mask].tolist() if case >= fixed})
+        if not extra and len(self._packed) == fixed + len(used):
+            return
+        kept = [self._packed[case] for case in used]
+        moved = {case: fixed + len(extra) + k for k, case in enumerate(used)}
+        self._cases[:] = [moved.get(case, min(case, fixed - 1)) for case in self._cases.tolist()]
+        self._pack([*self.tasks, *extra, *kept])
+
+    def _take_keys(self, seeds: Sequence[int | None], mask: Array) -> None:
+        """Give every environment that begins a new key where it is seeded or has none yet."""
+        for i in np.flatnonzero(mask).tolist():
+            seed = seeds[i]
+            if seed is None and self._episodes[i] >= 0:
+                continue
+            source = self.np_random if seed is None else seeding.np_random(seed)[0]
+            self._keys[i] = random_key(source)
+            self._episodes[i] = -1
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
+        """Drive one control period; see the class for actions, autoreset, infos and errors."""
+        observations, rewards, terminated, truncated = self.advance(actions)
+        infos = episode_infos(self._memories)
+        ended = terminated | truncated
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
+            infos.update(final_infos(self._final_memories, self._final_observations, ended))
+        return observations, rewards, terminated, truncated, infos
+
+    def advance(self, actions: Array) -> tuple[Array, Array, Array, Array]:
+        """`step` without infos, for those who do not read them."""
+        waiting = self._ends != kernels.RUNNING
+        self._check_order(waiting)
+        commands = self._checked_actions(actions, waiting)
+        n = self.num_envs
+        rewards = np.empty(n)
+        arguments = (
+            self._mode, self._memories, commands, self._cases, self._drawn, self._constants,
+            self._tables, self._rows, self._bound, self._keys, self._episodes, self._nothing_given,
+            self._observations, self._ends, rewards, self._final_memories, self._final_observations,
+        )  # fmt: skip
+        if self._threads == 1:
+            vector_kernels.advance(0, n, *arguments)
+        else:
+            _in_threads(self._threads, n, arguments)
+        ended = self._ends != kernels.RUNNING
+        truncated = self._ends == kernels.TIME_LIMIT
+        # A copy: a reset of some environments hands out the others' observations again.
+        return self._observations.copy(), rewards, ended & ~truncated, truncated
+
+    def _check_order(self, waiting: Array) -> None:
+        if self._episodes.min() < 0:
+            raise gymnasium.error.ResetNeeded("the episodes have not begun: call reset() first")
+        if self.autoreset_mode is AutoresetMode.DISABLED and waiting.any():
+            raise gymnasium.error.ResetNeeded(
+                f"the episode of environment {int(np.argmax(waiting))} has ended: call "
+                "reset(options={'reset_mask': mask}) before step()"
+            )
+
+    def _checked_actions(self, actions: Any, waiting: Array) -> Array:
+        """Actions as float64 (n, 2), after a check of those that are not ignored."""
+        shape = (self.num_envs, 2)
+        try:
+            given = np.asarray(actions)
+        except ValueError:
+            given = np.empty(0)
+        if given.shape != shape or given.dtype.kind not in "fiu":
+            raise ValueError(
+                f"actions must be an array {shape} of numbers [acceleration m/s^2, steering angle "
+                f"rad], not {given.shape} of {given.dtype}"
+            )
+        commands = np.ascontiguousarray(given, dtype=np.float64)
+        if not np.isfinite(commands).all():
+            bad = ~np.isfinite(commands)
+            if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+                bad &= ~waiting[:, None]
+            if bad.any():
+                index, entry = np.argwhere(bad)[0].tolist()
+                raise ValueError(
+                    f"action of environment {index}, entry {ENTRIES[entry]}, is not finite: "
+                    f"{given[index]!r}"
+                )
+        return commands
+
+    def _checked_mask(self, mask: Any) -> Array:
+        if mask is None:
+            return np.ones(self.num_envs, dtype=np.bool_)
+        if not (isinstance(mask, np.ndarray) and mask.dtype == np.bool_):
+            raise TypeError("options['reset_mask'] must be a NumPy array of dtype bool")
+        if mask.shape != (self.num_envs,):
+            raise ValueError(
+                f"options['reset_mask'] must have shape ({self.num_envs},), not {mask.shape}"
+            )
+        if not mask.any():
+            raise ValueError("options['reset_mask'] must mark at least one environment")
+        return mask.copy()
+
+    def _checked_seeds(self, seed: Any) -> Sequence[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if not isinstance(seed, Sequence):
+            return [operator.index(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"{len(seed)} seeds for num_envs={self.num_envs}: give one for each")
+        return list(seed)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Draw every environment: n frames (600, 900, 3) uint8, without trails."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() needs render_mode='rgb_array'")
+            return None
+        return tuple(
+            self._single.draw(self.task_of(i), self._memories[i]) for i in range(self.num_envs)
+        )
+
+    def close_extras(self, **_: Any) -> None:
+        """Free what drawing took."""
+        self._single.close()
+
+
+def _listed(kind: str, value: Any) -> list[Any]:
+    """Items of a sequence, or the one item; a str is an item."""
+    if not isinstance(value, list | tuple):
+        return [value]
+    if not value:
+        raise ValueError(f"{kind}: an empty sequence")
+    return list(value)
+
+
+def _checked_mode(value: AutoresetMode | str) -> AutoresetMode:
+    if isinstance(value, AutoresetMode):
+        return value
+    known = tuple(mode.value for mode in AutoresetMode)
+    return AutoresetMode(choose("autoreset_mode", value, known))
+
+
+def _checked_threads(value: int) -> int:
+    threads = operator.index(value)
+    most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    if not 1 <= threads <= most:
+        raise ValueError(
+            f"threads must be from 1 to {most} (the processors numba sees; NUMBA_NUM_THREADS sets "
+            f"it), not {value}"
+        )
+    if threads > 1:
+        # Else threads that wait spin, and on a busy machine a step takes 700 times as long.
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    return threads
+
+
+def _in_threads(threads: int, n: int, arguments: tuple[Any, ...]) -> None:
+    before = numba.get_num_threads()
+    numba.set_num_threads(threads)
+    try:
+        vector_kernels.advance_in_threads(threads, n, *arguments)
+    finally:
+        numba.set_num_threads(before)

@@ -1,0 +1,204 @@
+"""Compiled kernels of the vector environment: the single environment's, on blocks of vehicles.
+
+A block's states are copied into scratch rows of `LANES` vehicles each, and every Runge-Kutta step
+is one loop over a row, which the compiler turns into vector instructions. All else is the single
+environment's own functions, vehicle by vehicle. Bits are those of the single environment.
+"""
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from lpv_track_env import kernels as k
+from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
+from lpv_track_env.episodes import TRAJECTORY_DRAW, VEHICLE_DRAW, begin, choice
+from lpv_track_env.integration import integrate, per_mass, rotate, runge_kutta
+from trajectories.compilation import compiled, compiled_parallel
+
+Array = NDArray[Any]
+
+LANES = 32
+"""Vehicles in a block."""
+
+# Rows of the scratch, each LANES long: state, then
+COS, SIN, ACCELERATION, STEERING, COS_STEERING, SIN_STEERING, PARAMETERS = (
+    6 * LANES, 7 * LANES, 8 * LANES, 9 * LANES, 10 * LANES, 11 * LANES, 12 * LANES,
+)  # fmt: skip
+SUBSTEP, CLIPPED = 18 * LANES, 19 * LANES
+SCRATCH_SIZE = 20 * LANES
+
+NEXT_STEP, SAME_STEP, DISABLED = range(3)
+"""When an environment that has ended is reset, as `gymnasium.vector.AutoresetMode` says."""
+
+
+@compiled
+def integrate_lanes(b: Array, substeps: int) -> None:
+    """Runge-Kutta steps of all lanes of a scratch, the same number for each."""
+    for _ in range(substeps):
+        for j in range(LANES):
+            vx, vy, r, turn, dx, dy = runge_kutta(
+                b[j], b[LANES + j], b[3 * LANES + j], b[COS + j], b[SIN + j],
+                b[ACCELERATION + j], b[STEERING + j], b[COS_STEERING + j], b[SIN_STEERING + j],
+                b[PARAMETERS + j], b[PARAMETERS + LANES + j], b[PARAMETERS + 2 * LANES + j],
+                b[PARAMETERS + 3 * LANES + j], b[PARAMETERS + 4 * LANES + j],
+                b[PARAMETERS + 5 * LANES + j],
+                b[SUBSTEP + j], True,
+            )  # fmt: skip
+            c, s = rotate(b[COS + j], b[SIN + j], turn)
+            b[j], b[LANES + j], b[3 * LANES + j] = vx, vy, r
+            b[2 * LANES + j] += turn
+            b[4 * LANES + j] += dx
+            b[5 * LANES + j] += dy
+            b[COS + j], b[SIN + j] = c, s
+
+
+@compiled
+def load_lane(b: Array, j: int, memory: Array, action: Array, p: Array) -> int:
+    """Copy a vehicle into lane j: state, what its actuators give, parameters; its substeps."""
+    a, delta, bits = k.actuate(
+        action[0], action[1], memory[k.ACCELERATION], memory[k.STEERING],
+        p[k.MAX_STEERING], p[k.STEERING_STEP], p[k.LOWEST_ACCELERATION],
+        p[k.HIGHEST_ACCELERATION], p[k.ACCELERATION_STEP],
+    )  # fmt: skip
+    for row in range(6):
+        b[row * LANES + j] = memory[row]
+    b[COS + j], b[SIN + j] = math.cos(memory[PSI]), math.sin(memory[PSI])
+    b[ACCELERATION + j], b[STEERING + j] = a, delta
+    b[COS_STEERING + j], b[SIN_STEERING + j] = math.cos(delta), math.sin(delta)
+    inertia, front, rear = per_mass(p[0], p[1], p[4], p[5])
+    b[PARAMETERS + j], b[PARAMETERS + LANES + j] = inertia, p[2]
+    b[PARAMETERS + 2 * LANES + j], b[PARAMETERS + 3 * LANES + j] = p[3], front
+    b[PARAMETERS + 4 * LANES + j], b[PARAMETERS + 5 * LANES + j] = rear, p[6]
+    substeps = int(p[k.SUBSTEPS])
+    b[SUBSTEP + j] = p[k.PERIOD] / substeps
+    b[CLIPPED + j] = bits
+    return substeps
+
+
+@compiled
+def integrate_one(b: Array, j: int, memory: Array, p: Array) -> None:
+    """Integrate lane j alone: for blocks whose vehicles need different numbers of substeps."""
+    substeps = int(p[k.SUBSTEPS])
+    vx, vy, psi, r, x, y = integrate(
+        memory[VX], memory[VY], memory[PSI], memory[YAW_RATE], memory[X], memory[Y],
+        b[ACCELERATION + j], b[STEERING + j],
+        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[k.PERIOD] / substeps, substeps,
+    )  # fmt: skip
+    b[j], b[LANES + j], b[2 * LANES + j] = vx, vy, psi
+    b[3 * LANES + j], b[4 * LANES + j], b[5 * LANES + j] = r, x, y
+
+
+@compiled
+def begin_next(
+    i: int, memory: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
+    rows: Array, bound: Array, observation: Array, keys: Array, episodes: Array, given: Array,
+) -> None:  # fmt: skip
+    """Begin the next episode of environment i, on a path and with a vehicle that are drawn.
+
+    `drawn` holds the first case to draw from, the number of paths and that of vehicles; cases list
+    the combinations, vehicles side by side.
+    """
+    episodes[i] += 1
+    case, paths, vehicles = drawn
+    if paths > 1:
+        case += vehicles * choice(keys[i], episodes[i], TRAJECTORY_DRAW, paths)
+    if vehicles > 1:
+        case += choice(keys[i], episodes[i], VEHICLE_DRAW, vehicles)
+    cases[i] = case
+    table = tables[rows[case, 0] : rows[case, 1]]
+    begin(memory, constants[case], table, bound, observation, keys[i], episodes[i], given)
+
+
+@compiled
+def advance(
+    first: int, last: int, mode: int,
+    memories: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
+    rows: Array, bound: Array, keys: Array, episodes: Array, given: Array,
+    observations: Array, ends: Array, rewards: Array, final_memories: Array,
+    final_observations: Array,
+) -> None:  # fmt: skip
+    """One control period of the environments `first` to `last` - 1, with autoreset.
+
+    `ends` (n,) holds each environment's end code of the last step and is given the new one. In
+    NEXT_STEP an environment that had ended begins anew instead, with reward 0; in SAME_STEP one
+    that ends begins anew at once, its last memory and observation kept in the `final_` arrays.
+    """
+    b = np.empty(SCRATCH_SIZE)
+    counts = np.empty(LANES, dtype=np.int64)
+    for low in range(first, last, LANES):
+        lanes = min(LANES, last - low)
+        uniform = True
+        for j in range(LANES):
+            # Lanes beyond the last environment repeat the first: no lane holds rubbish.
+            i = low + j if j < lanes else low
+            counts[j] = load_lane(b, j, memories[i], actions[i], constants[cases[i]])
+            uniform = uniform and counts[j] == counts[0]
+        if uniform:
+            integrate_lanes(b, counts[0])
+        else:
+            for j in range(lanes):
+                integrate_one(b, j, memories[low + j], constants[cases[low + j]])
+        for j in range(lanes):
+            i = low + j
+            memory, observation = memories[i], observations[i]
+            if mode == NEXT_STEP and ends[i] != k.RUNNING:
+                begin_next(
+                    i, memory, cases, drawn, constants, tables, rows, bound, observation,
+                    keys, episodes, given,
+                )  # fmt: skip
+                ends[i], rewards[i] = k.RUNNING, 0.0
+                continue
+            case = cases[i]
+            ends[i] = k.finish(
+                memory, constants[case], tables[rows[case, 0] : rows[case, 1]], bound, observation,
+                b[VX * LANES + j], b[VY * LANES + j], b[PSI * LANES + j], b[YAW_RATE * LANES + j],
+                b[X * LANES + j], b[Y * LANES + j], b[ACCELERATION + j], b[STEERING + j],
+                int(b[CLIPPED + j]),
+            )  # fmt: skip
+            rewards[i] = memory[k.REWARD]
+            if mode == SAME_STEP and ends[i] != k.RUNNING:
+                final_memories[i] = memory
+                final_observations[i] = observation
+                begin_next(
+                    i, memory, cases, drawn, constants, tables, rows, bound, observation,
+                    keys, episodes, given,
+                )  # fmt: skip
+
+
+@compiled_parallel
+def advance_in_threads(
+    chunks: int, n: int, mode: int,
+    memories: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
+    rows: Array, bound: Array, keys: Array, episodes: Array, given: Array,
+    observations: Array, ends: Array, rewards: Array, final_memories: Array,
+    final_observations: Array,
+) -> None:  # fmt: skip
+    """`advance` on all n environments, in chunks of whole blocks that threads share."""
+    blocks = (n + LANES - 1) // LANES
+    for chunk in numba.prange(chunks):
+        first = chunk * blocks // chunks * LANES
+        last = min((chunk + 1) * blocks // chunks * LANES, n)
+        advance(
+            first, last, mode, memories, actions, cases, drawn, constants, tables, rows, bound,
+            keys, episodes, given, observations, ends, rewards, final_memories,
+            final_observations,
+        )  # fmt: skip
+
+
+@compiled
+def begin_all(
+    mask: Array,
+    memories: Array, cases: Array, drawn: Any, constants: Array, tables: Array, rows: Array,
+    bound: Array, keys: Array, episodes: Array, given: Array, observations: Array, ends: Array,
+) -> None:  # fmt: skip
+    """Begin the next episode of every environment that `mask` (n,) marks."""
+    for i in range(mask.shape[0]):
+        if mask[i]:
+            ends[i] = k.RUNNING
+            begin_next(
+                i, memories[i], cases, drawn, constants, tables, rows, bound, observations[i],
+                keys, episodes, given,
+            )  # fmt: skip
