@@ -144,24 +144,24 @@ def advance(
         for j in range(lanes):
             i = low + j
             memory, observation = memories[i], observations[i]
-            if mode == NEXT_STEP and ends[i] != k.RUNNING:
-                begin_next(
-                    i, memory, cases, drawn, constants, tables, rows, bound, observation,
-                    keys, episodes, given,
-                )  # fmt: skip
+            begins = mode == NEXT_STEP and ends[i] != k.RUNNING
+            if begins:
                 ends[i], rewards[i] = k.RUNNING, 0.0
-                continue
-            case = cases[i]
-            ends[i] = k.finish(
-                memory, constants[case], tables[rows[case, 0] : rows[case, 1]], bound, observation,
-                b[VX * LANES + j], b[VY * LANES + j], b[PSI * LANES + j], b[YAW_RATE * LANES + j],
-                b[X * LANES + j], b[Y * LANES + j], b[ACCELERATION + j], b[STEERING + j],
-                int(b[CLIPPED + j]),
-            )  # fmt: skip
-            rewards[i] = memory[k.REWARD]
-            if mode == SAME_STEP and ends[i] != k.RUNNING:
-                final_memories[i] = memory
-                final_observations[i] = observation
+            else:
+                case = cases[i]
+                ends[i] = k.finish(
+                    memory, constants[case], tables[rows[case, 0] : rows[case, 1]], bound,
+                    observation, b[VX * LANES + j], b[VY * LANES + j], b[PSI * LANES + j],
+                    b[YAW_RATE * LANES + j], b[X * LANES + j], b[Y * LANES + j],
+                    b[ACCELERATION + j], b[STEERING + j], int(b[CLIPPED + j]),
+                )  # fmt: skip
+                rewards[i] = memory[k.REWARD]
+                if mode == SAME_STEP and ends[i] != k.RUNNING:
+                    begins = True
+                    final_memories[i] = memory
+                    final_observations[i] = observation
+            # One call for both modes: every call is compiled in.
+            if begins:
                 begin_next(
                     i, memory, cases, drawn, constants, tables, rows, bound, observation,
                     keys, episodes, given,
