@@ -4,7 +4,7 @@ import operator
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numba
@@ -32,6 +32,27 @@ MODES = {
     AutoresetMode.DISABLED: vector_kernels.DISABLED,
 }
 ENTRIES = ("0 (acceleration)", "1 (steering angle)")
+
+
+class KernelArrays(NamedTuple):
+    """What the kernels know of n environments: see `kernels` for memories and constants."""
+
+    memories: Array
+    """(n, MEMORY_SIZE)."""
+    observations: Array
+    """(n, size) float32."""
+    ends: Array
+    """(n,) codes of `kernels.END_NAMES`."""
+    cases: Array
+    """(n,) index of each environment's constants and table."""
+    constants: Array
+    """(cases, CONSTANTS_SIZE)."""
+    tables: Array
+    """(nodes, 8), all paths one after another."""
+    rows: Array
+    """(cases, 2), first row of each table and the one after its last."""
+    bound: Array
+    """(size,) float32."""
 
 
 class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
@@ -178,6 +199,19 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
     def task_of(self, index: int) -> Task:
         """Task of the current episode of environment `index`: its path, its vehicle."""
         return self._packed[int(self._cases[index])]
+
+    @property
+    def single(self) -> PathTrackingEnv:
+        """A single environment of the same settings, the first path and vehicle: for agents."""
+        return self._single
+
+    @property
+    def arrays(self) -> KernelArrays:
+        """Arrays of the current episodes, not copies, for compiled code that steps them itself."""
+        return KernelArrays(
+            self._memories, self._observations, self._ends, self._cases, self._constants,
+            self._tables, self._rows, self._bound,
+        )  # fmt: skip
 
     @property
     def memories(self) -> Array:

@@ -184,7 +184,9 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         )  # fmt: skip
         memory.seconds = time.perf_counter() - began
         if memory.ladders or failed:
-            self._replace_failed(rows, memory)
+            self.replace_failed(
+                rows, memory, np.flatnonzero(memory.told[:, rti.CODE] != rti.SUCCESS)
+            )
         actions = memory.actions.astype(np.float32)
         np.clip(actions, self._low, self._high, out=actions)
         return (actions[0] if single else actions), memory
@@ -202,11 +204,16 @@ class RtiNmpc(NmpcAgent[RtiRow]):
                 weights[row] = self._weights
         return weights
 
-    def _replace_failed(self, rows: Array, memory: RtiMemory) -> None:
-        """Put what the ladder says in place of failed solves' actions."""
+    @property
+    def fixed_weights(self) -> Array:
+        """Q, S, R in use where no schedule chooses, (10,)."""
+        return self._weights
+
+    def replace_failed(self, rows: Array, memory: RtiMemory, failed: NDArray[np.intp]) -> None:
+        """Put what the ladder says in place of the actions of `failed` rows' solves."""
         for ladder in memory.ladders.values():
             ladder.fallback = ""
-        for row in np.flatnonzero(memory.told[:, rti.CODE] != rti.SUCCESS).tolist():
+        for row in failed.tolist():
             ladder = memory.ladders.setdefault(row, self.new_ladder())
             _, planned, age, failures = memory.flags[row].tolist()
             action = self.replace(

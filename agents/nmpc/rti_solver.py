@@ -17,8 +17,8 @@ STATUS = {
     rti.NOT_FINITE: Status.NAN,
     rti.QP_FAILURE: Status.QP_FAILURE,
 }
-DAMPING = (0.0, 0.3)
-"""Levenberg term on (a, delta)."""
+DAMPING = (0.0, 0.0)
+"""Levenberg term on (a, delta), by default."""
 
 
 def limits(problem: NmpcProblem, damping: tuple[float, float]) -> Array:
