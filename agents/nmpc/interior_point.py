@@ -50,6 +50,17 @@ SLACK_OF = (0, 2, 1)
 """Index in the problem's penalties (vx, vy, vx') of the soft constraints in their order here."""
 
 OPTIMAL, OUT_OF_ITERATIONS, BROKEN = 0, 1, 2
+GUESSING, PREDICTING, CORRECTING = 0, 1, 2
+"""Phases: the active-set method, then predictor and corrector in turns."""
+FREE, BINDING, BROKEN_SOFT = 0.0, 1.0, 2.0
+"""What a guess makes of a constraint: it is kept by itself, holds as an equation, is broken."""
+MAX_GUESSES = 6
+NEAR = 1e-4
+"""Gap below which a constraint of the plan is guessed to bind."""
+HELD = 1e-9
+"""Largest gap of a constraint that binds."""
+SLIGHT = 1e-9
+STIFFNESS = 1e7
 MAX_ITERATIONS = 40
 START_BARRIER = 1.0
 START_DISTANCE = 0.5
@@ -63,7 +74,7 @@ ACCEPTABLE = 1e-6
 @compiled
 def workspace_size(n: int) -> int:
     """Length of the workspace of `solve_qp` for N = n."""
-    return 6 * (n + 1) + (2 + GAIN + BARRIER + SLOPE + 9 * PAIRS + FUNCTIONALS + 6 + 1) * n
+    return 6 * (n + 1) + (2 + GAIN + BARRIER + SLOPE + 10 * PAIRS + FUNCTIONALS + 6 + 1) * n
 
 
 @compiled
@@ -102,6 +113,83 @@ def measure_gaps(
         for k in (8, 9, 11, 12, 14, 15):
             least = min(least, gaps[k, i])
     return least
+
+
+@compiled
+def guess(gaps: Array, mode: Array, lam: Array) -> None:
+    """Guess which constraints hold as equations, or are broken, from a plan's gaps."""
+    for k in range(PAIRS):
+        row, into, multiplier = gaps[k], mode[k], lam[k]
+        soft = k >= 8
+        for i in range(gaps.shape[1]):
+            multiplier[i] = 0.0
+            into[i] = FREE
+            if row[i] < NEAR:
+                into[i] = BROKEN_SOFT if soft and row[i] < -NEAR else BINDING
+    for k in (10, 13, 16):
+        mode[k] = FREE
+
+
+@compiled
+def hold(
+    gaps: Array, mode: Array, lam: Array, limits: Array, weight: Array, base: Array,
+    barrier: Array, slope: Array,
+) -> None:  # fmt: skip
+    """Fill `barrier` and `slope` for an equality-constrained step.
+
+    Binding constraints by an augmented Lagrangian, broken soft ones by their price.
+    """
+    n = gaps.shape[1]
+    for k in range(PAIRS):
+        row, into, multiplier, wk, bk = gaps[k], mode[k], lam[k], weight[k], base[k]
+        linear = quadratic = 0.0
+        if k >= 8:
+            linear, quadratic = limits[LINEAR + (k - 8) // 3], limits[QUADRATIC + (k - 8) // 3]
+        for i in range(n):
+            wk[i] = STIFFNESS if into[i] == BINDING else 0.0
+            bk[i] = multiplier[i] - STIFFNESS * row[i] if into[i] == BINDING else 0.0
+            wk[i] = quadratic if into[i] == BROKEN_SOFT else wk[i]
+            bk[i] = linear - quadratic * row[i] if into[i] == BROKEN_SOFT else bk[i]
+    ratio = limits[RATIO]
+    for i in range(n):
+        for f in range(4):
+            slope[f, i] = base[2 * f, i] - base[2 * f + 1, i]
+            barrier[f, i] = weight[2 * f, i] + weight[2 * f + 1, i]
+        slope[4, i], barrier[4, i] = base[11, i] - base[12, i], weight[11, i] + weight[12, i]
+        right, left, both = base[14, i], base[15, i], weight[14, i] + weight[15, i]
+        slope[5, i] = base[8, i] - base[9, i] - ratio * (right + left)
+        slope[6, i] = right - left
+        barrier[5, i] = weight[8, i] + weight[9, i] + ratio * ratio * both
+        barrier[6, i] = ratio * (weight[15, i] - weight[14, i])
+        barrier[7, i] = both
+
+
+@compiled
+def revise(gaps: Array, mode: Array, lam: Array, limits: Array) -> tuple[bool, Float]:
+    """Mend the guess after a step; whether it changed, and by how much what binds is missed."""
+    changed, off = False, 0.0
+    for k in range(PAIRS):
+        row, into, multiplier = gaps[k], mode[k], lam[k]
+        linear = limits[LINEAR + (k - 8) // 3] if k >= 8 else math.inf
+        if k in {10, 13, 16}:
+            continue
+        for i in range(gaps.shape[1]):
+            gap, was = row[i], into[i]
+            if was == FREE:
+                if gap < -HELD:
+                    into[i], multiplier[i], changed = BINDING, 0.0, True
+            elif was == BINDING:
+                force = multiplier[i] - STIFFNESS * gap
+                if force < -SLIGHT:
+                    into[i], multiplier[i], changed = FREE, 0.0, True
+                elif force > linear:
+                    into[i], changed = BROKEN_SOFT, True
+                else:
+                    multiplier[i] = force
+                    off = max(off, abs(gap))
+            elif gap > HELD:
+                into[i], multiplier[i], changed = BINDING, linear, True
+    return changed, off
 
 
 @compiled
@@ -329,55 +417,62 @@ def solve_qp(
     at += BARRIER * n
     slope = work[at : at + SLOPE * n].reshape(SLOPE, n)
     at += SLOPE * n
-    pairs = work[at : at + 9 * PAIRS * n].reshape(9, PAIRS, n)
+    pairs = work[at : at + 10 * PAIRS * n].reshape(10, PAIRS, n)
     gaps, t, lam, residual = pairs[0], pairs[1], pairs[2], pairs[3]
     inverse, weight, base, dt, dlam = pairs[4], pairs[5], pairs[6], pairs[7], pairs[8]
-    at += 9 * PAIRS * n
+    mode = pairs[9]
+    at += 10 * PAIRS * n
     functionals = work[at : at + FUNCTIONALS * n].reshape(FUNCTIONALS, n)
     at += FUNCTIONALS * n
     eliminated = work[at : at + 6 * n].reshape(6, n)
     at += 6 * n
     longest = work[at : at + n]
 
-    barrier[:] = 0.0
-    slope[:] = 0.0
     for i in range(n):
         inputs[i, 0], inputs[i, 1] = plan[i, 0], plan[i, 1]
     for i in range(n + 1):
         for k in range(6):
             states[i, k] = base_states[i, k]
     mu, centre, worst, share = START_BARRIER, 0.0, 0.0, 1.0
-    # Pass 0 knows no inequalities; then predictors (odd) and correctors (even) take turns. Each
-    # part is called from one place only: compiling takes half as long.
-    for turn in range(2 * MAX_ITERATIONS + 1):
-        predicting = turn % 2 == 1
-        if turn > 0:
+    phase, tries, iterations = GUESSING, 0, 0
+    changed = True
+    # All methods take turns through one loop: each part is called from one place only, which
+    # halves the time that compiling takes.
+    while True:
+        if phase == GUESSING:
+            if tries == 0:
+                measure_gaps(records, base_states, plan, states, inputs, last, limits, gaps)
+                guess(gaps, mode, lam)
+            hold(gaps, mode, lam, limits, weight, base, barrier, slope)
+        else:
             condense(
-                t, lam, residual, share, centre, dt, predicting, limits, inverse, weight, base,
-                eliminated, barrier, slope,
+                t, lam, residual, share, centre, dt, phase == PREDICTING, limits, inverse, weight,
+                base, eliminated, barrier, slope,
             )  # fmt: skip
-        if predicting or turn == 0:
+        if phase == PREDICTING or (phase == GUESSING and changed):
             riccati.factor(records, weights, damping_a, damping_delta, barrier, gains)
         riccati.solve(
             records, gains, weights, damping_a, damping_delta, states, inputs, plan, reference,
             slope, dx, du,
         )  # fmt: skip
         length = 1.0
-        if turn > 0:
+        if phase != GUESSING:
             length = expand(
                 records, dx, du, t, lam, residual, share, limits, inverse, weight, base,
                 eliminated, functionals, dt, dlam, longest,
             )  # fmt: skip
-        if predicting:
+        if phase == PREDICTING:
             centre = _centre(t, lam, dt, dlam, min(1.0, length), mu, longest)
+            phase = CORRECTING
             continue
         total = 0.0
         for i in range(n):
             total += du[i, 0] + du[i, 1] + dx[i + 1, X]
         if not math.isfinite(total):
-            good = turn > 0 and mu <= ACCEPTABLE and share * worst <= ACCEPTABLE
-            return _finish(t, inputs, last, limits, slack, OPTIMAL if good else BROKEN), turn // 2
-        if turn > 0:
+            good = phase != GUESSING and mu <= ACCEPTABLE and share * worst <= ACCEPTABLE
+            code = OPTIMAL if good else BROKEN
+            return _finish(t, inputs, last, limits, slack, code), iterations
+        if phase == CORRECTING:
             length = min(1.0, max(CAUTION, min(1.0 - mu, LEAST_CAUTION)) * length)
             mu = _update(t, lam, dt, dlam, length, longest)
             share *= 1.0 - length
@@ -387,24 +482,30 @@ def solve_qp(
         for i in range(n + 1):
             for k in range(6):
                 states[i, k] += length * dx[i, k]
-        if turn > 0:
+        iterations += 1
+        if phase == CORRECTING:
             if mu <= tolerance and share * worst <= tolerance:
-                return _finish(t, inputs, last, limits, slack, OPTIMAL), turn // 2
+                return _finish(t, inputs, last, limits, slack, OPTIMAL), iterations
+            if iterations >= MAX_ITERATIONS:
+                return _finish(t, inputs, last, limits, slack, OUT_OF_ITERATIONS), iterations
+            phase = PREDICTING
             continue
-        kept = True
-        for attempt in range(2):
-            least = measure_gaps(records, base_states, plan, states, inputs, last, limits, gaps)
-            if attempt == 1 or least >= 0.0:
-                break
-            # Start where all inputs keep their limits.
-            kept = False
+        tries += 1
+        measure_gaps(records, base_states, plan, states, inputs, last, limits, gaps)
+        changed, off = revise(gaps, mode, lam, limits)
+        if not changed and off <= HELD:
+            for soft in range(3):
+                for i in range(n):
+                    least = min(gaps[8 + 3 * soft, i], gaps[9 + 3 * soft, i])
+                    t[10 + 3 * soft, i] = max(-least, 0.0)
+            return _finish(t, inputs, last, limits, slack, OPTIMAL), iterations
+        if tries == MAX_GUESSES:
+            # Start the interior-point method where all inputs keep their limits.
             clamp(inputs, last, limits)
             follow(records, base_states, plan, inputs, states)
-        if kept:
-            slack[:] = 0.0
-            return OPTIMAL, 0
-        worst = start(gaps, limits, t, lam, residual)
-    return _finish(t, inputs, last, limits, slack, OUT_OF_ITERATIONS), MAX_ITERATIONS
+            measure_gaps(records, base_states, plan, states, inputs, last, limits, gaps)
+            worst = start(gaps, limits, t, lam, residual)
+            phase = PREDICTING
 
 
 @compiled
