@@ -31,9 +31,6 @@ RESET_OPTIONS = (
     "speed_error",
 )
 NUMBERS = (float, int)
-ACTION_SHAPE = (2,)
-ACTION_TYPES = (np.dtype(np.float32), np.dtype(np.float64))
-"""Arrays of these pass the action check in few operations; all else is looked at more closely."""
 
 
 class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -279,13 +276,12 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             )
         # What a step costs beside its kernel is spent here: few operations for the usual action, a
         # closer look at all else. An action that is refused leaves the episode untouched.
-        if (
-            type(action) is np.ndarray
-            and action.shape == ACTION_SHAPE
-            and action.dtype in ACTION_TYPES
-        ):
-            a, delta = action.tolist()
+        values = action.tolist() if type(action) is np.ndarray else action
+        if type(values) is list and len(values) == 2:
+            a, delta = values
         else:
+            a, delta = _two_numbers(action)
+        if type(a) is not float or type(delta) is not float:
             a, delta = _two_numbers(action)
         if not (isfinite(a) and isfinite(delta)):
             entry = "1 (steering angle)" if isfinite(a) else "0 (acceleration)"
