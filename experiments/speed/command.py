@@ -3,12 +3,15 @@
 import importlib.metadata
 import json
 import os
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from rich.console import Console
@@ -74,12 +77,18 @@ def run_speed(
         TimeElapsedColumn(), console=console, disable=not console.is_terminal, transient=True,
     )  # fmt: skip
     try:
-        with progress:
+        with progress, Interrupts() as interrupts:
             bar = progress.add_task("", total=len(chosen))
+
+            def tick(text: str) -> None:
+                interrupts.check()
+                progress.update(bar, description=text)
+
             for name in SECTIONS:
                 if name not in chosen:
                     continue
-                _measure(name, result, effort, lambda text: progress.update(bar, description=text))
+                _measure(name, result, effort, tick)
+                interrupts.check()
                 _write(result, folder)
                 progress.advance(bar)
                 if not console.is_terminal:
@@ -94,6 +103,32 @@ def run_speed(
         write_atomically(folder / "speed.png", drawn)
     tables.show(result, console)
     return result, bool(result["complete"])
+
+
+class Interrupts:
+    """Ctrl-C, remembered: where it comes during a solve, CasADi takes it for a failed solve."""
+
+    def __init__(self) -> None:
+        self._came = False
+        self._before: Any = None
+
+    def __enter__(self) -> "Interrupts":
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._remember)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _remember(self, _number: int, _frame: FrameType | None) -> None:
+        self._came = True
+        raise KeyboardInterrupt
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if it has come."""
+        if self._came:
+            raise KeyboardInterrupt
 
 
 def _measure(name: str, result: dict[str, Any], effort: Effort, tick: Tick) -> None:
@@ -150,5 +185,5 @@ def _load() -> list[float] | None:
 def _write(result: dict[str, Any], folder: Path) -> None:
     result["written"] = datetime.now(UTC).isoformat(timespec="seconds")
     result["machine"]["load_average_after"] = _load()
-    content = json.dumps(result, indent=1, sort_keys=True, allow_nan=False)
+    content = json.dumps(result, indent=1, allow_nan=False)
     write_atomically(folder / "speed.json", content.encode() + b"\n")

@@ -5,15 +5,18 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.figures import COLOURS
 from experiments.speed.measure import WINDOW_MEDIAN
-from experiments.speed.tables import label
+from experiments.speed.tables import differing, label
 
 Result = Mapping[str, Any]
 MARKERS = "os^Dv<>P"
+DECADE = 10.0
 
 
 def picture(result: Result) -> bytes | None:
@@ -56,11 +59,12 @@ def _spread(series: list[Result], factor: float) -> tuple[list[float], list[list
 
 
 def _lines(section: Result, ax: Axes, key: str, factor: float) -> None:
-    """A line per series over one of its settings, log-log."""
+    """A line per series over one of its settings, its values logarithmic."""
+    keys = differing(section) - {key}
     groups: dict[str, list[Result]] = {}
     for series in section["series"]:
         if series["unit"] != WINDOW_MEDIAN:
-            groups.setdefault(label(series, without=key), []).append(series)
+            groups.setdefault(label(series, keys), []).append(series)
     for k, (name, series) in enumerate(groups.items()):
         x = [one["settings"][key] for one in series]
         y, bars = _spread(series, factor)
@@ -68,37 +72,64 @@ def _lines(section: Result, ax: Axes, key: str, factor: float) -> None:
             x, y, bars, label=name, color=COLOURS[k % len(COLOURS)],
             marker=MARKERS[k % len(MARKERS)], markersize=5, linewidth=1.5, capsize=2,
         )  # fmt: skip
+    ax.set_xticks(sorted({one["settings"][key] for one in section["series"]}))
     ax.set_yscale("log")
+    _plain(ax.yaxis)
     ax.legend(fontsize="small")
 
 
-def _bars(section: Result, ax: Axes, unit: str, factor: float) -> None:
-    """A bar per series of a unit, on a logarithmic axis."""
+def _dots(section: Result, ax: Axes, unit: str, factor: float) -> None:
+    """A dot per series of a unit on a logarithmic axis, its 99th percentile as a stroke."""
     series = [one for one in section["series"] if one["unit"] == unit]
-    middle, bars = _spread(series, factor)
-    names = [label(one) for one in series]
-    ax.barh(names, middle, xerr=bars, color=COLOURS[: len(series)], capsize=3)
-    for k, value in enumerate(middle):
-        ax.annotate(f" {value:.3g}", (value, k), va="bottom", fontsize="small")
+    middle, (low, high) = _spread(series, factor)
+    for k, one in enumerate(series):
+        colour = COLOURS[k % len(COLOURS)]
+        ax.errorbar(
+            [middle[k]], [k], xerr=[[low[k]], [high[k]]], color=colour, marker="o", capsize=3
+        )
+        if "p99" in one:
+            ax.plot([factor * one["p99"]], [k], color=colour, marker="|", markersize=16)
+        ax.annotate(
+            f"{middle[k]:.3g}", (middle[k], k), (0, 6), textcoords="offset points", ha="center"
+        )
+    ax.set_yticks(range(len(series)), [label(one, differing(section)) for one in series])
+    ax.set_ylim(len(series) - 0.5, -0.5)
     ax.set_xscale("log")
-    ax.invert_yaxis()
+    _plain(ax.xaxis)
+
+
+def _plain(axis: Axis) -> None:
+    """Plain numbers at 1, 2 and 5 of every decade of a logarithmic axis, or at more of a part."""
+    low, high = axis.get_view_interval()
+    subs = (1.0, 2.0, 5.0) if high > DECADE * low else tuple(range(1, 10))
+    axis.set_major_locator(LogLocator(subs=subs))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _doubling(ax: Axes, what: str) -> None:
+    """A logarithmic x axis of numbers that are each written out."""
+    ticks = ax.get_xticks()
+    ax.set_xscale("log", base=2)
+    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    ax.minorticks_off()
+    ax.set_xlabel(what)
 
 
 def _single(section: Result, ax: Axes) -> None:
-    _bars(section, ax, "s/step", 1e6)
-    ax.set_xlabel("µs per step, logarithmic")
+    _dots(section, ax, "s/step", 1e6)
+    ax.set_xlabel("µs per step")
 
 
 def _vector(section: Result, ax: Axes) -> None:
     _lines(section, ax, "n", 1e9)
-    ax.set_xscale("log", base=2)
-    ax.set_xlabel("environments")
+    _doubling(ax, "environments stepped together")
     ax.set_ylabel("ns per env-step")
 
 
 def _solvers(section: Result, ax: Axes) -> None:
-    _bars(section, ax, "s/predict", 1e3)
-    ax.set_xlabel("ms per predict, median with least and greatest, logarithmic")
+    _dots(section, ax, "s/predict", 1e3)
+    ax.set_xlabel("ms per predict (stroke: 99th percentile)")
 
 
 def _horizons(section: Result, ax: Axes) -> None:
@@ -109,8 +140,7 @@ def _horizons(section: Result, ax: Axes) -> None:
 
 def _batches(section: Result, ax: Axes) -> None:
     _lines(section, ax, "n", 1e3)
-    ax.set_xscale("log", base=2)
-    ax.set_xlabel("observations in a batch")
+    _doubling(ax, "observations in a batch")
     ax.set_ylabel("ms per solve")
 
 

@@ -69,10 +69,10 @@ def cartpole_vector(n: int) -> Run:
 def cartpole_envpool(n: int) -> Run:
     """CartPole of envpool on one thread."""
     make = module("envpool").make_gymnasium
+    actions = np.random.default_rng(0).integers(0, 2, (16, n)).astype(np.int32)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the precision of its own spaces
-        env = make("CartPole-v1", num_envs=n, num_threads=1)
-    return stepping(env, np.random.default_rng(0).integers(0, 2, (16, n)).astype(np.int32))
+        warnings.simplefilter("ignore")  # of the precision of its own spaces, of the reset's seed
+        return stepping(make("CartPole-v1", num_envs=n, num_threads=1, seed=0), actions)
 
 
 def cartpole_gymnax(n: int) -> Run:

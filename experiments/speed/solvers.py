@@ -114,9 +114,11 @@ def _measure(
     windows: Sequence[Window],
     solvers: dict[str, agents.base.Agent],
     repeats: int,
+    tick: Tick,
     **settings: Any,
 ) -> None:
     """Every solver on every window in turn: all its solves, and its median on each window."""
+    told = ", ".join([*solvers, *(f"{key} {value}" for key, value in settings.items())])
     medians: dict[str, Series] = {}
     all_solves: dict[str, Series] = {}
     for label, agent in solvers.items():
@@ -126,6 +128,7 @@ def _measure(
     for window in list(windows) * repeats:
         for label, agent in solvers.items():
             seconds = solve_times(agent, window)
+            tick(f"solvers in turn: {told}")
             all_solves[label].rounds += seconds
             medians[label].rounds.append(float(np.median(seconds)))
     labels = list(solvers)
@@ -147,8 +150,7 @@ def solvers(section: Section, effort: Effort, tick: Tick) -> None:
         windows += record(trajectory, HORIZON, effort.windows, effort.window)
     env = environment(effort.trajectories[0])
     made = peers.available({label: partial(make, label, env) for label in SOLVERS}, section.lacks)
-    tick(f"solvers: {', '.join(made)} in turn")
-    _measure(section, windows, made, effort.repeats, horizon=HORIZON)
+    _measure(section, windows, made, effort.repeats, tick, horizon=HORIZON)
 
 
 def horizons(section: Section, effort: Effort, tick: Tick) -> None:
@@ -163,7 +165,7 @@ def horizons(section: Section, effort: Effort, tick: Tick) -> None:
         made = peers.available(
             {label: partial(make, label, env) for label in SOLVERS}, section.lacks
         )
-        _measure(section, windows, made, effort.repeats, horizon=horizon)
+        _measure(section, windows, made, effort.repeats, tick, horizon=horizon)
 
 
 def batches(section: Section, effort: Effort, tick: Tick) -> None:

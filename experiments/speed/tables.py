@@ -24,10 +24,9 @@ def quantity(value: float, unit: str) -> str:
         return f"{value / 2**20:.1f} MiB" if value >= 2**20 else f"{value:.0f} B"
     if unit.startswith("share"):
         return f"{100.0 * value:.1f} %"
-    scale, name = next(pair for pair in (*SCALES, SCALES[-1]) if value >= pair[0] or pair[0] < 1e-8)
-    return (
-        f"{value / scale:.3g} {name}" if value < 1000.0 * scale else f"{value / scale:.0f} {name}"
-    )
+    scale, name = next((pair for pair in SCALES if value >= pair[0]), SCALES[-1])
+    digits = ".3g" if value < 999.5 * scale else ".0f"
+    return f"{value / scale:{digits}} {name}"
 
 
 def rate(value: float) -> str:
@@ -57,30 +56,29 @@ def ratio_of(section: Result, series: Result) -> Result | None:
     return None
 
 
-def _varied(section: Result) -> str | None:
-    for key in OVER:
-        if len({series["settings"].get(key) for series in section["series"]}) > 1 and all(
-            key in series["settings"] for series in section["series"]
-        ):
-            return key
-    return None
+def differing(section: Result) -> set[str]:
+    """Settings that are not the same in all series of a section."""
+    settings = [series["settings"] for series in section["series"]]
+    return {
+        key for one in settings for key in one
+        if any(other.get(key) != one[key] for other in settings)
+    }  # fmt: skip
 
 
-def label(series: Result, *, without: str | None = None) -> str:
-    """Name of a series with the settings that tell it from others."""
-    told = {
-        key: value
-        for key, value in series["settings"].items()
-        if key != without and not (key == "threads" and value == 1)
-    }
-    words = [f"{value} threads" if key == "threads" else f"{key} {value}" for key, value in
-             told.items()]  # fmt: skip
+def label(series: Result, keys: set[str]) -> str:
+    """Name of a series with some of its settings."""
+    told = {key: value for key, value in series["settings"].items() if key in keys}
+    if told.get("threads") == 1:
+        del told["threads"]
+    words = [
+        f"{value} threads" if key == "threads" else f"{key} {value}" for key, value in told.items()
+    ]
     return ", ".join([series["name"], *words])
 
 
 def section_table(section: Result) -> Table:
     """A table of one section that has series."""
-    key = _varied(section)
+    key = next((key for key in OVER if key in differing(section)), None)
     return _list(section) if key is None else _grid(section, key)
 
 
@@ -90,13 +88,13 @@ def _shown(section: Result) -> list[Result]:
 
 def _list(section: Result) -> Table:
     """A row per series; columns that would be empty are left out."""
-    rows = []
+    rows, keys = [], differing(section)
     for series in _shown(section):
         unit = series["unit"]
         low, high = quantity(series["min"], unit), quantity(series["max"], unit)
         rows.append(
             {
-                "": label(series),
+                "": label(series, keys),
                 "in": unit,
                 "median": quantity(series["median"], unit),
                 "a second": rate(series["median"]) if unit.startswith("s/") else "",
@@ -105,7 +103,7 @@ def _list(section: Result) -> Table:
                 "ratio to ours": ratio(ratio_of(section, series)),
             }
         )
-    table = Table(title=section["title"], box=box.SIMPLE_HEAD, title_justify="left")
+    table = Table(box=box.SIMPLE_HEAD)
     headings = [heading for heading in rows[0] if any(row[heading] for row in rows)]
     for heading in headings:
         table.add_column(heading, justify="left" if heading in {"", "in"} else "right")
@@ -116,15 +114,14 @@ def _list(section: Result) -> Table:
 
 def _grid(section: Result, key: str) -> Table:
     """A row per value of a setting, a column per series; ratios to ours below the medians."""
-    series = _shown(section)
-    title = f"{section['title']}: median {series[0]['unit']}, below it the ratio to ours"
-    table = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left")
+    series, keys = _shown(section), differing(section) - {key}
+    table = Table(box=box.SIMPLE_HEAD)
     table.add_column(key, justify="right")
-    columns = list(dict.fromkeys(label(one, without=key) for one in series))
+    columns = list(dict.fromkeys(label(one, keys) for one in series))
     for column in columns:
         table.add_column(column, justify="right")
     for value in dict.fromkeys(one["settings"][key] for one in series):
-        row = {label(one, without=key): one for one in series if one["settings"][key] == value}
+        row = {label(one, keys): one for one in series if one["settings"][key] == value}
         cells = []
         for column in columns:
             one = row.get(column)
@@ -142,8 +139,11 @@ def _grid(section: Result, key: str) -> Table:
 def show(result: Result, console: Console) -> None:
     """Print every section, what was left out and why, and how busy the machine was."""
     for section in result["sections"].values():
+        console.print(section["title"], style="bold", highlight=False)
         if section["series"]:
             console.print(section_table(section))
+        if section["ratios"]:
+            console.print("x: times as long as ours, median (min..max) of the rounds", style="dim")
         for note in section["notes"]:
             console.print(note, style="dim", highlight=False, markup=False)
         for missing in section["unavailable"]:
@@ -151,8 +151,7 @@ def show(result: Result, console: Console) -> None:
                 f"left out: {missing['name']}: {missing['reason']}", style="yellow",
                 markup=False, highlight=False,
             )  # fmt: skip
-        if section["series"] or section["unavailable"]:
-            console.print()
+        console.print()
     console.print(load(result), highlight=False)
 
 
