@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.figures import COLOURS
-from experiments.speed.measure import WINDOW_MEDIAN
-from experiments.speed.tables import differing, label
+from experiments.speed.tables import differing, label, leading
 
 Result = Mapping[str, Any]
 MARKERS = "os^Dv<>P"
@@ -62,9 +61,8 @@ def _lines(section: Result, ax: Axes, key: str, factor: float) -> None:
     """A line per series over one of its settings, its values logarithmic."""
     keys = differing(section) - {key}
     groups: dict[str, list[Result]] = {}
-    for series in section["series"]:
-        if series["unit"] != WINDOW_MEDIAN:
-            groups.setdefault(label(series, keys), []).append(series)
+    for one in leading(section):
+        groups.setdefault(label(one, keys), []).append(one)
     for k, (name, series) in enumerate(groups.items()):
         x = [one["settings"][key] for one in series]
         y, bars = _spread(series, factor)
@@ -78,9 +76,9 @@ def _lines(section: Result, ax: Axes, key: str, factor: float) -> None:
     ax.legend(fontsize="small")
 
 
-def _dots(section: Result, ax: Axes, unit: str, factor: float) -> None:
-    """A dot per series of a unit on a logarithmic axis, its 99th percentile as a stroke."""
-    series = [one for one in section["series"] if one["unit"] == unit]
+def _dots(section: Result, ax: Axes, factor: float) -> None:
+    """A dot per series on a logarithmic axis, its 99th percentile as a stroke."""
+    series = leading(section)
     middle, (low, high) = _spread(series, factor)
     for k, one in enumerate(series):
         colour = COLOURS[k % len(COLOURS)]
@@ -117,7 +115,7 @@ def _doubling(ax: Axes, what: str) -> None:
 
 
 def _single(section: Result, ax: Axes) -> None:
-    _dots(section, ax, "s/step", 1e6)
+    _dots(section, ax, 1e6)
     ax.set_xlabel("µs per step")
 
 
@@ -128,7 +126,7 @@ def _vector(section: Result, ax: Axes) -> None:
 
 
 def _solvers(section: Result, ax: Axes) -> None:
-    _dots(section, ax, "s/predict", 1e3)
+    _dots(section, ax, 1e3)
     ax.set_xlabel("ms per predict (stroke: 99th percentile)")
 
 

@@ -21,6 +21,8 @@ Tick = Callable[[str], None]
 
 SHORTEST = 1e-7
 """s, that a clock's reading is taken for at least."""
+PREDICT = "s/predict"
+COLD_START = "s/predict, first of an episode"
 WINDOW_MEDIAN = "s/predict, median of a window"
 """Unit of rounds that are medians themselves: for ratios, beside a series of every solve."""
 MANY = 100

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from experiments.speed.measure import WINDOW_MEDIAN
+from experiments.speed.measure import PREDICT, WINDOW_MEDIAN
 
 Result = Mapping[str, Any]
 OVER = ("n", "horizon")
@@ -50,7 +50,7 @@ def ratio_of(section: Result, series: Result) -> Result | None:
     for found in section["ratios"]:
         same = found["other"] == series["name"]
         if same and found["settings"]["other"] == series["settings"]:
-            of_medians = found["unit"] == WINDOW_MEDIAN and series["unit"] == "s/predict"
+            of_medians = found["unit"] == WINDOW_MEDIAN and series["unit"] == PREDICT
             if found["unit"] == series["unit"] or of_medians:
                 return dict(found)
     return None
@@ -82,15 +82,18 @@ def section_table(section: Result) -> Table:
     return _list(section) if key is None else _grid(section, key)
 
 
-def _shown(section: Result) -> list[Result]:
-    return [series for series in section["series"] if series["unit"] != WINDOW_MEDIAN]
+def leading(section: Result) -> list[Result]:
+    """The series in the unit of the section's first one, which is what it is about."""
+    return [one for one in section["series"] if one["unit"] == section["series"][0]["unit"]]
 
 
 def _list(section: Result) -> Table:
     """A row per series; columns that would be empty are left out."""
     rows, keys = [], differing(section)
-    for series in _shown(section):
+    for series in section["series"]:
         unit = series["unit"]
+        if unit == WINDOW_MEDIAN:
+            continue
         low, high = quantity(series["min"], unit), quantity(series["max"], unit)
         rows.append(
             {
@@ -114,7 +117,7 @@ def _list(section: Result) -> Table:
 
 def _grid(section: Result, key: str) -> Table:
     """A row per value of a setting, a column per series; ratios to ours below the medians."""
-    series, keys = _shown(section), differing(section) - {key}
+    series, keys = leading(section), differing(section) - {key}
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column(key, justify="right")
     columns = list(dict.fromkeys(label(one, keys) for one in series))
