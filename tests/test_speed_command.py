@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
+from rich.text import Text
 
 import agents
 import trajectories
@@ -141,6 +142,19 @@ def test_tables_show_every_series_and_how_busy_the_machine_was(tiny: Path) -> No
     assert result["machine"]["processor"] in text
     ratio = result["sections"]["single"]["ratios"][0]
     assert f"x {ratio['median']:.3g} ({ratio['min']:.3g}..{ratio['max']:.3g})" in text
+
+
+def test_a_setting_of_some_series_makes_no_rows_of_it() -> None:
+    section = Section("Memory")
+    section.add("one", "bytes").rounds.append(3.0)
+    section.add("each", "bytes", n=64).rounds.append(5.0)
+    table = tables.section_table(section.as_dict())
+    assert [list(column.cells) for column in table.columns][0] == [Text("one"), Text("each, n 64")]
+    for n in (1, 4):
+        section.add("grows", "bytes", n=n).rounds.append(1.0)
+    section.series = section.series[2:]
+    table = tables.section_table(section.as_dict())
+    assert [list(column.cells) for column in table.columns] == [["1", "4"], ["1 B", "1 B"]]
 
 
 def test_a_busy_machine_is_said_to_be() -> None:

@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium
 
+import agents
 from experiments.speed import environments, peers
 from experiments.speed.measure import Effort, Section, Tick
 from lpv_track_env.registration import PATH_TRACKING
@@ -43,8 +44,10 @@ def _ours() -> Any:
     from gymnasium.vector import AutoresetMode
 
     peers.module("stable_baselines3")
-    env = environments.make_vector(ENVS, autoreset_mode=AutoresetMode.SAME_STEP)
-    return peers.module("agents.sb3").sb3_vec_env(env)
+    adapt = getattr(agents, "sb3_vec_env", None)
+    if adapt is None:
+        raise peers.Unavailable(peers.ABSENT)
+    return adapt(environments.make_vector(ENVS, autoreset_mode=AutoresetMode.SAME_STEP))
 
 
 def _in_sequence() -> Any:

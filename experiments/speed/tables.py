@@ -78,7 +78,8 @@ def label(series: Result, keys: set[str]) -> str:
 
 def section_table(section: Result) -> Table:
     """A table of one section that has series."""
-    key = next((key for key in OVER if key in differing(section)), None)
+    everywhere = set.intersection(*(set(series["settings"]) for series in section["series"]))
+    key = next((key for key in OVER if key in differing(section) & everywhere), None)
     return _list(section) if key is None else _grid(section, key)
 
 
