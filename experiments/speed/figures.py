@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.figures import COLOURS
-from experiments.speed.tables import differing, label, leading
+from experiments.speed.tables import differing, label, leading, quantity
 
 Result = Mapping[str, Any]
 MARKERS = "os^Dv<>P"
@@ -87,9 +87,8 @@ def _dots(section: Result, ax: Axes, factor: float) -> None:
         )
         if "p99" in one:
             ax.plot([factor * one["p99"]], [k], color=colour, marker="|", markersize=16)
-        ax.annotate(
-            f"{middle[k]:.3g}", (middle[k], k), (0, 6), textcoords="offset points", ha="center"
-        )
+        text = quantity(one["median"], one["unit"])
+        ax.annotate(text, (middle[k], k), (0, 6), textcoords="offset points", ha="center")
     ax.set_yticks(range(len(series)), [label(one, differing(section)) for one in series])
     ax.set_ylim(len(series) - 0.5, -0.5)
     ax.set_xscale("log")
