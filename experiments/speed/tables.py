@@ -132,10 +132,9 @@ def _grid(section: Result, key: str) -> Table:
             if one is None:
                 cells.append("")
                 continue
-            against = ratio_of(section, one)
-            cells.append(
-                quantity(one["median"], one["unit"]) + (f"\n{ratio(against)}" if against else "")
-            )
+            # In a narrow column the range goes below.
+            against = ratio(ratio_of(section, one)).replace(" (", "\n(")
+            cells.append(f"{quantity(one['median'], one['unit'])}\n{against}".rstrip())
         table.add_row(str(value), *cells)
     return table
 
