@@ -290,6 +290,17 @@ def test_a_round_is_calibrated_to_its_length() -> None:
     assert slow() == 5.0
 
 
+def test_a_first_time_that_compiles_does_not_shorten_the_rounds() -> None:
+    counts: list[int] = []
+
+    def run(count: int) -> float:
+        counts.append(count)
+        return 0.001 * count + (10.0 if len(counts) == 1 else 0.0)
+
+    calibrated(run, 0.1)()
+    assert counts[-1] == 100
+
+
 def test_of_many_rounds_there_is_a_99th_percentile() -> None:
     assert "p99" not in Series("a", "s", rounds=[1.0] * 99).as_dict()
     rounds = list(np.arange(1.0, 202.0))

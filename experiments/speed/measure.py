@@ -161,7 +161,11 @@ def summary(rounds: Sequence[float]) -> dict[str, float]:
 
 
 def calibrated(run: Run, seconds: float) -> Round:
-    """A round of about `seconds`: the number of times is found here, which also warms it up."""
+    """A round of about `seconds`: the number of times is found here.
+
+    The first time of all is not counted on: it may compile.
+    """
+    run(1)
     count, took = 1, run(1)
     while took < 0.25 * seconds:
         count *= 2
