@@ -103,6 +103,18 @@ def parser() -> argparse.ArgumentParser:
     )
     paths.add_argument("--draw", type=Path, metavar="FILE", help="picture, .png or .svg")
     paths.add_argument("--write", type=Path, metavar="DIR", help="write native CSV files")
+
+    speed = add(
+        "speed",
+        "Measure how fast the environments and the solvers are, against their peers.",
+        "lpv-track speed --only single vector --out results/speed",
+    )
+    speed.add_argument("--out", type=Path, default=Path("results/speed"), metavar="DIR")
+    speed.add_argument(
+        "--only", nargs="+", default=[], metavar="SECTION",
+        help="single, vector, learning, solvers, horizons, batches, memory, startup (default: all)",
+    )  # fmt: skip
+    speed.add_argument("--quick", action="store_true", help="tiny: shows that it works, no more")
     return root
 
 
@@ -142,6 +154,18 @@ def run(options: argparse.Namespace) -> int:
         )
         case.check()
         return drive(case, console, frames=options.frames, every=options.every)
+    if options.command == "speed":
+        from experiments.speed.command import run_speed
+
+        _, complete = run_speed(
+            options.out, only=options.only, quick=options.quick, console=console
+        )
+        console.print(
+            f"{'every round' if complete else 'interrupted; what was measured'}: "
+            f"{options.out / 'speed.json'}",
+            markup=False, highlight=False, soft_wrap=True,
+        )  # fmt: skip
+        return 0 if complete else EXIT_INTERRUPTED
     return _trajectories(options, console)
 
 

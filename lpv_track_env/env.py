@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from lpv_track_env import episodes, kernels, vehicle
 from lpv_track_env.episodes import given_start, random_key
 from lpv_track_env.observation import ObservationLayout
-from lpv_track_env.reward import TERMS, RewardWeights
+from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import CONDITIONS, Task, action_space, checked_period, choose, reference
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
@@ -166,7 +167,15 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._running = False
         self._key, self._episode = np.uint64(0), -1
         self._renderer: Renderer | None = None
+        self._open_views()
         self._use(self.base_task)
+
+    def _open_views(self) -> None:
+        """Parts of the arrays that every step needs: to make a view costs as much as a copy."""
+        self._state = self._memory[:6]
+        self._judged = self._memory[kernels.ARC_LENGTH :]
+        # Python numbers pass through a memoryview in half the time.
+        self._command: Any = self._action.data
 
     def _use(self, task: Task) -> None:
         if getattr(self, "task", None) is task:
@@ -174,6 +183,10 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.task = task
         self._constants = task.constants()
         self._table = task.path.table
+        self._arguments = (
+            self._memory, self._action, self._constants, self._table, self._bound,
+            self._observation,
+        )  # fmt: skip
 
     @property
     def path(self) -> ReferencePath:
@@ -198,7 +211,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     @property
     def state(self) -> NDArray[np.float64]:
         """True state [vx, vy, psi, r, X, Y], (6,), a copy."""
-        return self._memory[:6].copy()
+        return self._state.copy()
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -222,7 +235,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer.begin(task)
         if self.render_mode == "human":
             self.render()
-        return self._observation.copy(), self._info()
+        return self._observation.copy(), self._outcome()[1]
 
     def _count_episode(self, *, reseeded: bool) -> None:
         """Take a new key from `np_random` if it was seeded, else go on to the next episode."""
@@ -250,60 +263,58 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise gymnasium.error.ResetNeeded(
                 "the episode has not begun or has ended: call reset() before step()"
             )
-        self._take(action)
-        end = kernels.step(
-            self._memory, self._action, self._constants, self._table, self._bound, self._observation
-        )
-        info = self._info()
-        memory = self._memory
+        # What a step costs beside its kernel is spent here: few operations for the usual action, a
+        # closer look at all else. An action that is refused leaves the episode untouched.
+        values = action.tolist() if type(action) is np.ndarray else action
+        if type(values) is list and len(values) == 2:
+            a, delta = values
+        else:
+            a, delta = _two_numbers(action)
+        if type(a) is not float or type(delta) is not float:
+            a, delta = _two_numbers(action)
+        if not (isfinite(a) and isfinite(delta)):
+            entry = "1 (steering angle)" if isfinite(a) else "0 (acceleration)"
+            raise ValueError(f"action entry {entry} is not finite: {action!r}")
+        command = self._command
+        command[0] = a
+        command[1] = delta
+        end = kernels.step(*self._arguments)
+        reward, info = self._outcome()
+        terminated = truncated = False
         if end:
             info["end"] = kernels.END_NAMES[end]
+            truncated = end == kernels.TIME_LIMIT
+            terminated = not truncated
             self._running = False
         if self._renderer is not None:
-            self._renderer.follow(memory)
+            self._renderer.follow(self._memory)
         if self.render_mode == "human":
             self.render()
-        truncated = end == kernels.TIME_LIMIT
-        return (
-            self._observation.copy(),
-            float(memory[kernels.REWARD]),
-            bool(end) and not truncated,
-            truncated,
-            info,
-        )
+        return self._observation.copy(), reward, terminated, truncated, info
 
-    def _take(self, action: Any) -> None:
-        """Check an action and keep it, leaving the episode untouched if it is refused."""
-        try:
-            # Through plain Python values: a number is then told from text, bool or complex.
-            values = np.asarray(action).tolist()
-            a, delta = values
-            if not (type(values) is list and type(a) in NUMBERS and type(delta) in NUMBERS):
-                raise TypeError
-            a, delta = float(a), float(delta)
-        except (TypeError, ValueError, OverflowError):
-            raise ValueError(
-                "action must be two numbers [acceleration m/s^2, steering angle rad], "
-                f"not {action!r}"
-            ) from None
-        if not (math.isfinite(a) and math.isfinite(delta)):
-            entry = "1 (steering angle)" if math.isfinite(a) else "0 (acceleration)"
-            raise ValueError(f"action entry {entry} is not finite: {action!r}")
-        self._action[0] = a
-        self._action[1] = delta
-
-    def _info(self) -> dict[str, Any]:
-        memory = self._memory
-        values = memory.tolist()
-        parts = values[kernels.TERMS : kernels.TERMS + len(TERMS)]
-        return {
-            "lateral_error": values[kernels.LATERAL_ERROR],
-            "heading_error": values[kernels.HEADING_ERROR],
-            "speed_error": values[kernels.SPEED_ERROR],
-            "arc_length": values[kernels.ARC_LENGTH],
-            "state": memory[:6].copy(),
-            "reward_terms": dict(zip(TERMS, parts, strict=True)),
-            "clipped": int(values[kernels.CLIPPED]),
+    def _outcome(self) -> tuple[float, dict[str, Any]]:
+        """Reward of the last step and the info of the present situation."""
+        # In the order of the indices in `kernels`, taken apart at once: to look them up one by one
+        # takes several times as long.
+        (
+            arc_length, _, _, lateral_error, heading_error, speed_error, _, clipped, _, reward,
+            progress, lateral, heading, speed, input_rate, end,
+        ) = self._judged.tolist()  # fmt: skip
+        return reward, {
+            "lateral_error": lateral_error,
+            "heading_error": heading_error,
+            "speed_error": speed_error,
+            "arc_length": arc_length,
+            "state": self._state.copy(),
+            "reward_terms": {
+                "progress": progress,
+                "lateral": lateral,
+                "heading": heading,
+                "speed": speed,
+                "input_rate": input_rate,
+                "end": end,
+            },
+            "clipped": int(clipped) if clipped else 0,
         }
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -341,7 +352,29 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_renderer": None}
+        # Copied on their own, the views would no longer look at the arrays.
+        views = {"_state", "_judged", "_command"}
+        kept = {name: value for name, value in self.__dict__.items() if name not in views}
+        return {**kept, "_renderer": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._open_views()
+
+
+def _two_numbers(action: Any) -> tuple[float, float]:
+    """Two real numbers out of anything that holds no more and no less than these."""
+    try:
+        # Through plain Python values: a number is then told from text, bool or complex.
+        values = np.asarray(action).tolist()
+        a, delta = values
+        if not (type(values) is list and type(a) in NUMBERS and type(delta) in NUMBERS):
+            raise TypeError
+        return float(a), float(delta)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(
+            f"action must be two numbers [acceleration m/s^2, steering angle rad], not {action!r}"
+        ) from None
 
 
 def _load_vehicle(value: str | Path | VehicleParameters) -> VehicleParameters:

@@ -266,6 +266,9 @@ BAD_ACTIONS: dict[str, tuple[Any, str]] = {
     "objects": (np.array([object(), object()]), "must be two numbers"),
     "ragged": ([0.0, [1.0]], "must be two numbers"),
     "huge": ([10**400, 0], "must be two numbers"),
+    "record": (np.array((1.0, 0.0), dtype=[("a", float), ("b", float)]), "must be two numbers"),
+    "dates": (np.array(["2000", "2001"], "M8[D]"), "must be two numbers"),
+    "subclass-nan": (np.array([0.0, math.nan]).view(np.recarray), "entry 1 .steering angle."),
 }
 
 
@@ -281,15 +284,70 @@ def test_bad_action_is_refused_and_changes_nothing(action: Any, message: str) ->
     assert_same(env.step(good), untouched.step(good))
 
 
-@pytest.mark.parametrize(
-    "action", [[0.4, 0.01], (0.4, 0.01), np.array([0.4, 0.01]), np.array([0.4, 0.01], np.float16)]
-)
+GOOD_ACTIONS: dict[str, Any] = {
+    "list": [0.4, 0.01],
+    "tuple": (0.4, 0.01),
+    "integers": [1, 0],
+    "array-scalars": [np.float32(0.4), np.float64(0.01)],
+    "float32": np.array([0.4, 0.01], np.float32),
+    "float64": np.array([0.4, 0.01]),
+    "float16": np.array([0.4, 0.01], np.float16),
+    "int64": np.array([1, 0]),
+    "uint8": np.array([1, 0], np.uint8),
+    "big-endian": np.array([0.4, 0.01], ">f4"),
+    "strided": np.array([0.4, 9.0, 0.01, 9.0], np.float32)[::2],
+    "subclass": np.array([0.4, 0.01], np.float32).view(np.recarray),
+}
+
+
+@pytest.mark.parametrize("action", GOOD_ACTIONS.values(), ids=GOOD_ACTIONS.keys())
 def test_any_two_real_numbers_are_an_action(action: Any) -> None:
     env, other = make(trajectory="u-turn"), make(trajectory="u-turn")
     env.reset(seed=0)
     other.reset(seed=0)
     wanted = other.step(np.array(action, dtype=np.float64))
     assert_same(env.step(action), wanted)
+    # As the dynamics see it, and so neither swapped nor rounded.
+    assert env._action.tolist() == np.array(action, dtype=np.float64).tolist()
+
+
+def test_a_readonly_action_is_taken_and_left_alone() -> None:
+    env = make(trajectory="u-turn")
+    env.reset(seed=0)
+    action = np.array([0.4, 0.01], dtype=np.float32)
+    action.flags.writeable = False
+    env.step(action)
+    assert action.tolist() == np.array([0.4, 0.01], dtype=np.float32).tolist()
+
+
+def test_info_holds_plain_python_values_and_the_state() -> None:
+    env = make(trajectory="u-turn")
+    _, first = env.reset(seed=0)
+    assert set(first["reward_terms"].values()) == {0.0}
+    _, reward, terminated, truncated, info = env.step(np.array([0.4, 0.3], dtype=np.float32))
+    for said in (first, info):
+        assert type(said) is dict
+        assert list(said) == [
+            "lateral_error", "heading_error", "speed_error", "arc_length", "state",
+            "reward_terms", "clipped",
+        ]  # fmt: skip
+        state, terms, clipped = said["state"], said["reward_terms"], said["clipped"]
+        assert isinstance(state, np.ndarray)
+        assert (state.shape, state.dtype) == ((6,), np.float64)
+        assert state.base is None
+        assert type(terms) is dict
+        assert {type(value) for value in terms.values()} == {float}
+        assert type(clipped) is int
+        assert {type(said[name]) for name in list(said)[:4]} == {float}
+    assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
+    memory = env._memory
+    for name in ("lateral_error", "heading_error", "speed_error", "arc_length", "clipped"):
+        assert info[name] == memory[getattr(kernels, name.upper())]
+    assert info["clipped"] == kernels.RATE_STEERING
+    assert list(info["reward_terms"].values()) == memory[kernels.TERMS :][: len(TERMS)].tolist()
+    assert tuple(info["reward_terms"]) == TERMS
+    assert reward == memory[kernels.REWARD]
+    np.testing.assert_array_equal(info["state"], memory[:6])
 
 
 @pytest.mark.parametrize("period", [0.02, 0.05, 0.1])

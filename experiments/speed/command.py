@@ -1,0 +1,189 @@
+"""`lpv-track speed`: measure sections, keep every round, print tables, draw."""
+
+import importlib.metadata
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
+
+from experiments.results import hardware, revision, versions
+from experiments.speed import environments, learning, processes, solvers, tables
+from experiments.speed.figures import picture
+from experiments.speed.measure import FULL, QUICK, Effort, Section, Tick
+from lpv_track_env.task import choose
+from trajectories.atomic import write_atomically
+
+FORMAT = "lpv-track-speed/1"
+Measure = Callable[[Section, Effort, Tick], None]
+
+SECTIONS: dict[str, tuple[str, Measure]] = {
+    "single": ("One environment through gymnasium.make", environments.single),
+    "vector": ("Environments stepped together", environments.vector),
+    "learning": ("Share of PPO's time that the environments take", learning.learning),
+    "solvers": ("NMPC solvers on the same observations", solvers.solvers),
+    "horizons": ("NMPC solvers over the horizon", solvers.horizons),
+    "batches": ("NMPC on batches of observations", solvers.batches),
+    "memory": ("Memory of fresh processes", processes.memory),
+    "startup": ("Start-up of fresh processes", processes.startup),
+}
+"""Title and function of each section, in the order in which they run: adding one is a line here,
+and one in `figures.PANELS` if it is drawn."""
+PEERS = ("highway-env", "gymnax", "jax", "envpool")
+
+
+def run_speed(
+    folder: Path, *, only: Sequence[str] = (), quick: bool = False, console: Console
+) -> tuple[dict[str, Any], bool]:
+    """Measure, write `speed.json` after each section and `speed.png` at the end, print tables.
+
+    Returns
+    -------
+    result
+        What `speed.json` holds.
+    complete
+        False if it was interrupted; what was measured until then is written all the same.
+
+    Raises
+    ------
+    ValueError
+        For an unknown section.
+    OSError
+        If the folder cannot be written.
+    """
+    chosen = [choose("section", name, tuple(SECTIONS)) for name in only] or list(SECTIONS)
+    effort = QUICK if quick else FULL
+    folder.mkdir(parents=True, exist_ok=True)
+    result = _empty(effort, chosen, quick=quick)
+    progress = Progress(
+        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+        TimeElapsedColumn(), console=console, disable=not console.is_terminal, transient=True,
+    )  # fmt: skip
+    try:
+        with progress, Interrupts() as interrupts:
+            bar = progress.add_task("", total=len(chosen))
+
+            def tick(text: str) -> None:
+                interrupts.check()
+                progress.update(bar, description=text)
+
+            for name in SECTIONS:
+                if name not in chosen:
+                    continue
+                _measure(name, result, effort, tick)
+                interrupts.check()
+                _write(result, folder)
+                progress.advance(bar)
+                if not console.is_terminal:
+                    seconds = result["sections"][name]["seconds"]
+                    console.print(f"{name}: {seconds:.0f} s", highlight=False)
+        result["complete"] = True
+    except KeyboardInterrupt:
+        pass
+    _write(result, folder)
+    drawn = picture(result)
+    if drawn is not None:
+        write_atomically(folder / "speed.png", drawn)
+    tables.show(result, console)
+    return result, bool(result["complete"])
+
+
+class Interrupts:
+    """Ctrl-C, remembered: where it comes during a solve, CasADi takes it for a failed solve."""
+
+    def __init__(self) -> None:
+        self._came = False
+        self._before: Any = None
+
+    def __enter__(self) -> "Interrupts":
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._remember)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _remember(self, _number: int, _frame: FrameType | None) -> None:
+        self._came = True
+        raise KeyboardInterrupt
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if it has come."""
+        if self._came:
+            raise KeyboardInterrupt
+
+
+def _measure(name: str, result: dict[str, Any], effort: Effort, tick: Tick) -> None:
+    """One section into the result, also what an interrupted one has."""
+    title, measure = SECTIONS[name]
+    section = Section(title)
+    before, began = _load(), time.perf_counter()
+    try:
+        measure(section, effort, tick)
+    finally:
+        result["sections"][name] = {
+            **section.as_dict(),
+            "seconds": time.perf_counter() - began,
+            "load_average_before": before,
+        }
+
+
+def _empty(effort: Effort, chosen: Sequence[str], *, quick: bool) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "written": None,
+        "complete": False,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "settings": {"quick": quick, "sections": list(chosen), **asdict(effort)},
+        "machine": {
+            **hardware(),
+            "versions": {**versions(), **_peer_versions()},
+            "revision": revision(),
+            "threads": {
+                name: os.environ[name] for name in sorted(os.environ) if name.endswith("_THREADS")
+            },
+            "load_average_before": _load(),
+            "load_average_after": None,
+        },
+        "sections": {},
+    }
+
+
+def _peer_versions() -> Mapping[str, str]:
+    found = {}
+    for package in PEERS:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _load() -> list[float] | None:
+    """Load average over 1, 5 and 15 minutes, where the system tells it."""
+    return list(os.getloadavg()) if hasattr(os, "getloadavg") else None
+
+
+def _write(result: dict[str, Any], folder: Path) -> None:
+    result["written"] = datetime.now(UTC).isoformat(timespec="seconds")
+    result["machine"]["load_average_after"] = _load()
+    content = json.dumps(result, indent=1, allow_nan=False)
+    write_atomically(folder / "speed.json", content.encode() + b"\n")

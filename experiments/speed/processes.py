@@ -1,0 +1,165 @@
+"""Sections of fresh processes: how much memory they take, and how soon they have begun.
+
+Each is a child with its own interpreter that does one thing and reports; the clock runs from before
+it is started.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import agents
+from experiments.speed import peers
+from experiments.speed.measure import Effort, Section, Series, Tick
+
+LIMIT = 300.0
+"""s, after which a child is given up."""
+# Peak resident set of this program: ru_maxrss also remembers the parent that it was forked from.
+REPORT = """
+import json, resource, sys, time
+done = time.time()
+try:
+    lines = open("/proc/self/status").read().splitlines()
+    peak = next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) * 1024
+except (OSError, StopIteration):
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    peak *= 1 if sys.platform == "darwin" else 1024
+print(json.dumps({"done": done, "peak": peak}))
+"""
+MAKE = """
+import gymnasium, lpv_track_env
+env = gymnasium.make("lpv_track_env/PathTracking-v0", trajectory="T2")
+observation, _ = env.reset(seed=0)
+"""
+STEP = MAKE + "env.step(env.action_space.sample())\n"
+SOLVE = MAKE + "import agents\nagents.make({name!r}, env).predict(observation)\n"
+VECTOR = """
+import numpy as np
+from lpv_track_env.vector_env import PathTrackingVectorEnv
+env = PathTrackingVectorEnv(trajectory="T2", num_envs={n})
+env.reset(seed=0)
+env.step(np.zeros(({n}, 2), dtype=np.float32))
+"""
+INTERPRETER = ("bare interpreter", "import lpv_track_env")
+"""These compile nothing."""
+IPOPT, NMPC, VECTOR_ENV = "first solve of lpv-nmpc-ipopt", "first solve of lpv-nmpc", "vector env"
+
+
+def programs(large: int) -> dict[str, str]:
+    """What the children run, by what they show."""
+    return {
+        "bare interpreter": "",
+        "import lpv_track_env": "import lpv_track_env\n",
+        "first step": STEP,
+        NMPC: SOLVE.format(name="lpv-nmpc"),
+        IPOPT: SOLVE.format(name="lpv-nmpc-ipopt"),
+        f"{VECTOR_ENV} of 1": VECTOR.format(n=1),
+        f"{VECTOR_ENV} of {large}": VECTOR.format(n=large),
+    }
+
+
+class ChildFailed(Exception):  # noqa: N818  not an error: said, and gone on
+    """A child that did not report, with the last line it said."""
+
+
+def child(program: str, cache: Path | None = None) -> tuple[float, float]:
+    """Seconds until a fresh process has run a program, and its peak resident set in bytes.
+
+    `cache` is a folder for numba's cache instead of the usual one.
+
+    Raises
+    ------
+    ChildFailed
+        If it does not end well.
+    """
+    environment = dict(os.environ)
+    if cache is not None:
+        environment["NUMBA_CACHE_DIR"] = str(cache)
+    began = time.time()
+    try:
+        ended = subprocess.run(  # noqa: S603  our own program
+            [sys.executable, "-c", program + REPORT],
+            env=environment, capture_output=True, text=True, timeout=LIMIT, check=False,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise ChildFailed(f"not done within {LIMIT:.0f} s") from None
+    if ended.returncode != 0:
+        said = ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"]
+        raise ChildFailed(said[-1])
+    report: dict[str, Any] = json.loads(ended.stdout.strip().splitlines()[-1])
+    return report["done"] - began, float(report["peak"])
+
+
+def _absent(program: str) -> str | None:
+    """Why this version cannot run a program, or None if it can."""
+    if "vector_env" in program:
+        try:
+            peers.module("lpv_track_env.vector_env")
+        except peers.Unavailable as reason:
+            return str(reason)
+    if "'lpv-nmpc'" in program and "lpv-nmpc" not in agents.names():
+        return peers.ABSENT
+    return None
+
+
+def _possible(section: Section, large: int) -> dict[str, str]:
+    """Programs that this version can run; the section is told of the others."""
+    found = {}
+    for name, program in programs(large).items():
+        reason = _absent(program)
+        if reason is None:
+            found[name] = program
+        else:
+            section.lacks(name, reason)
+    return found
+
+
+def memory(section: Section, effort: Effort, tick: Tick) -> None:
+    """Peak resident set of fresh processes, and bytes per environment of a vector env."""
+    section.notes.append("Peak resident set of a fresh process that does this and no more.")
+    peaks: dict[str, Series] = {}
+    for name, program in _possible(section, effort.large).items():
+        peaks[name] = section.add(name, "bytes")
+        tick(f"memory: {name}")
+        try:
+            for _ in range(effort.processes):
+                peaks[name].rounds.append(child(program)[1])
+        except ChildFailed as reason:
+            section.lacks(name, str(reason))
+    one = peaks.get(f"{VECTOR_ENV} of 1")
+    many = peaks.get(f"{VECTOR_ENV} of {effort.large}")
+    if one is not None and many is not None:
+        each = section.add(f"{VECTOR_ENV}, per environment", "bytes", n=effort.large)
+        each.rounds = [
+            (large - small) / (effort.large - 1)
+            for small, large in zip(one.rounds, many.rounds, strict=False)
+        ]
+
+
+def startup(section: Section, effort: Effort, tick: Tick) -> None:
+    """Wall time from starting a process to its first step or solve."""
+    section.notes.append(
+        "Seconds from starting a process until this is done. Warm: compiled code is in numba's "
+        "cache; cold: that cache is an empty folder, as on the first use after an installation."
+    )
+    possible = _possible(section, effort.large)
+    possible.pop(f"{VECTOR_ENV} of {effort.large}", None)
+    for name, program in possible.items():
+        try:
+            tick(f"start-up: {name}, warm")
+            child(program)  # whatever was not yet compiled is now
+            warm = section.add(name, "s", cache="warm")
+            for _ in range(effort.processes):
+                warm.rounds.append(child(program)[0])
+            if effort.cold and name not in INTERPRETER:
+                tick(f"start-up: {name}, cold")
+                cold = section.add(name, "s", cache="cold")
+                with tempfile.TemporaryDirectory() as cache:
+                    cold.rounds.append(child(program, Path(cache))[0])
+        except ChildFailed as reason:
+            section.lacks(name, str(reason))
