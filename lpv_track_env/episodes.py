@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lpv_track_env import kernels
 from lpv_track_env.bicycle import PSI, VX, X, Y
 from trajectories.compilation import compiled
-from trajectories.projection import heading_at, position_at, speed_at
+from trajectories.interpolation import heading_at, position_at, speed_at
 
 Array = NDArray[Any]
 

@@ -15,7 +15,9 @@ from lpv_track_env.integration import integrate
 from lpv_track_env.observation import SCALARS
 from lpv_track_env.reward import terms
 from trajectories.compilation import compiled
-from trajectories.projection import SEARCH_WINDOW, cell, fill_preview, follow, saturate, speed_in
+from trajectories.interpolation import cell, saturate, speed_in
+from trajectories.preview import fill_preview
+from trajectories.projection import SEARCH_WINDOW, follow
 
 Array = NDArray[Any]
 

@@ -172,6 +172,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._keys = np.zeros(n, dtype=np.uint64)
         self._episodes = np.full(n, -1)
         self._ends = np.zeros(n, dtype=np.int64)
+        self._begun = False
         self._nothing_given = np.full(len(GIVEN), np.nan)
 
     def _tasks_of(self, paths: Sequence[Any], cars: Sequence[Any]) -> list[Task]:
@@ -295,9 +296,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
 
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array]:
         """`step` without infos, for those who do not read them."""
-        waiting = self._ends != kernels.RUNNING
-        self._check_order(waiting)
-        commands = self._checked_actions(actions, waiting)
+        self._check_order()
+        commands = self._checked_actions(actions)
         n = self.num_envs
         rewards = np.empty(n)
         arguments = (
@@ -314,16 +314,18 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         # A copy: a reset of some environments hands out the others' observations again.
         return self._observations.copy(), rewards, ended & ~truncated, truncated
 
-    def _check_order(self, waiting: Array) -> None:
-        if self._episodes.min() < 0:
-            raise gymnasium.error.ResetNeeded("the episodes have not begun: call reset() first")
-        if self.autoreset_mode is AutoresetMode.DISABLED and waiting.any():
+    def _check_order(self) -> None:
+        if not self._begun:
+            if self._episodes.min() < 0:
+                raise gymnasium.error.ResetNeeded("the episodes have not begun: call reset() first")
+            self._begun = True
+        if self.autoreset_mode is AutoresetMode.DISABLED and self._ends.any():
             raise gymnasium.error.ResetNeeded(
-                f"the episode of environment {int(np.argmax(waiting))} has ended: call "
+                f"the episode of environment {int(np.argmax(self._ends != 0))} has ended: call "
                 "reset(options={'reset_mask': mask}) before step()"
             )
 
-    def _checked_actions(self, actions: Any, waiting: Array) -> Array:
+    def _checked_actions(self, actions: Any) -> Array:
         """Actions as float64 (n, 2), after a check of those that are not ignored."""
         shape = (self.num_envs, 2)
         try:
@@ -336,16 +338,13 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
                 f"rad], not {given.shape} of {given.dtype}"
             )
         commands = np.ascontiguousarray(given, dtype=np.float64)
-        if not np.isfinite(commands).all():
-            bad = ~np.isfinite(commands)
-            if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-                bad &= ~waiting[:, None]
-            if bad.any():
-                index, entry = np.argwhere(bad)[0].tolist()
-                raise ValueError(
-                    f"action of environment {index}, entry {ENTRIES[entry]}, is not finite: "
-                    f"{given[index]!r}"
-                )
+        bad = vector_kernels.first_bad(commands, self._ends, self._mode)
+        if bad >= 0:
+            index, entry = divmod(bad, 2)
+            raise ValueError(
+                f"action of environment {index}, entry {ENTRIES[entry]}, is not finite: "
+                f"{given[index]!r}"
+            )
         return commands
 
     def _checked_mask(self, mask: Any) -> Array:

@@ -25,11 +25,12 @@ def episode_infos(memories: Array, mask: Array | None = None) -> Infos:
         (n,) bool.
     """
     # One copy in which every entry is a row of its own.
-    values = memories.T.copy()
     if mask is None:
         mask = np.ones(len(memories), dtype=np.bool_)
-    elif not mask.all():
-        values[:, ~mask] = 0.0
+        values = memories.T.copy()
+    else:
+        values = np.zeros(memories.T.shape)
+        values[:, mask] = memories[mask].T
     terms: Infos = {}
     for k, name in enumerate(TERMS):
         terms[name], terms[f"_{name}"] = values[kernels.TERMS + k], mask

@@ -92,6 +92,21 @@ def integrate_one(b: Array, j: int, memory: Array, p: Array) -> None:
 
 
 @compiled
+def first_bad(commands: Array, ends: Array, mode: int) -> int:
+    """Index into the flat `commands` (n, 2) of the first that is not finite, or -1.
+
+    In NEXT_STEP commands to environments that have ended are ignored.
+    """
+    for i in range(commands.shape[0]):
+        if mode == NEXT_STEP and ends[i] != k.RUNNING:
+            continue
+        for j in range(2):
+            if not math.isfinite(commands[i, j]):
+                return 2 * i + j
+    return -1
+
+
+@compiled
 def begin_next(
     i: int, memory: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
     rows: Array, bound: Array, observation: Array, keys: Array, episodes: Array, given: Array,

@@ -148,7 +148,7 @@ def test_function_that_numba_cannot_cache_warns_and_works() -> None:
 )
 def test_without_a_writable_cache_it_warns_and_works(tmp_path: Path) -> None:
     """Permissions do not stop root, so numba is left with one folder that cannot exist."""
-    code = "import trajectories.projection as p\nprint(*p.cell(2.5, 4.0, False, 5))\n"
+    code = "import trajectories.interpolation as p\nprint(*p.cell(2.5, 4.0, False, 5))\n"
     result = run(
         code, tmp_path, NUMBA_CACHE_LOCATOR_CLASSES="UserProvidedCacheLocator",
         NUMBA_CACHE_DIR="/dev/null/nowhere",

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trajectories import projection
+from trajectories import interpolation, projection
+from trajectories import preview as previewing
 
 SPACING = 0.25
 """m, the grid of arc length that every path is kept on (up to fitting its length exactly)."""
@@ -176,7 +177,7 @@ class ReferencePath:
 
     @cached_property
     def table(self) -> Array:
-        """(n, 8) nodes as compiled code takes them, columns as in `trajectories.projection`."""
+        """(n, 8) nodes as compiled code takes them, columns as in `trajectories.interpolation`."""
         return np.ascontiguousarray(
             np.column_stack(
                 [
@@ -198,14 +199,14 @@ class ReferencePath:
         rows = np.empty((s.size, 7))
         for k, value in enumerate(s.ravel()):
             arguments = (self.table, self.length, self.closed, float(value))
-            index, _ = projection.cell(float(value), self.length, self.closed, len(self.x))
+            index, _ = interpolation.cell(float(value), self.length, self.closed, len(self.x))
             rows[k] = (
-                *projection.position_at(*arguments),
-                projection.heading_at(*arguments),
-                projection.curvature_at(*arguments),
-                projection.speed_at(*arguments),
+                *interpolation.position_at(*arguments),
+                interpolation.heading_at(*arguments),
+                interpolation.curvature_at(*arguments),
+                interpolation.speed_at(*arguments),
                 self.acceleration[index],
-                projection.time_at(*arguments),
+                interpolation.time_at(*arguments),
             )
         return PathSample(*(column.reshape(s.shape) for column in rows.T))
 
@@ -229,7 +230,7 @@ class ReferencePath:
         """Arc length that the reference has reached at some times (s) after its start, m."""
         times = _finite("time", time)
         values = [
-            projection.arc_length_at(self.table, self.length, self.closed, float(t), 0)[0]
+            interpolation.arc_length_at(self.table, self.length, self.closed, float(t), 0)[0]
             for t in times.ravel()
         ]
         return np.array(values).reshape(times.shape)
@@ -242,7 +243,7 @@ class ReferencePath:
         """
         _finite("arc length and period", (s, period))
         curvature, speed = np.empty(count), np.empty(count)
-        projection.preview(
+        previewing.preview(
             self.table, self.length, self.closed, float(s), float(period), curvature, speed
         )
         return Preview(curvature, speed)
