@@ -277,7 +277,7 @@ def test_ladder_of_fallbacks(
         if told["fallback"] == "stop":
             assert action[0] < 0
     assert seen == ["plan"] * 4 + ["stop"] * 2
-    assert memory[0].counts == {"INFEASIBLE": 6, "plan": 4, "stop": 2}
+    assert memory[0].ladder.counts == {"INFEASIBLE": 6, "plan": 4, "stop": 2}
     assert memory[0].warm is None
     # Without any plan to fall back on: Stanley.
     _, memory = agent.predict(observation, episode_start=np.array([True]))
