@@ -103,6 +103,22 @@ def parser() -> argparse.ArgumentParser:
     )
     paths.add_argument("--draw", type=Path, metavar="FILE", help="picture, .png or .svg")
     paths.add_argument("--write", type=Path, metavar="DIR", help="write native CSV files")
+
+    verify = add(
+        "verify",
+        "Check the real-time NMPC against independent solvers, models and derivatives.",
+        "lpv-track verify --states 200 --out results/verify",
+    )
+    verify.add_argument("--states", type=int, default=1000, metavar="N", help="default 1000")
+    verify.add_argument("--quick", action="store_true", help="24 states, whatever --states says")
+    verify.add_argument("--seed", type=int, default=0)
+    verify.add_argument(
+        "--solver", metavar="MODULE:CLASS", help="default: the real-time solver of lpv-nmpc"
+    )
+    verify.add_argument("--out", type=Path, default=Path("results/verify"), metavar="DIR")
+    verify.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores"
+    )
     return root
 
 
@@ -142,6 +158,17 @@ def run(options: argparse.Namespace) -> int:
         )
         case.check()
         return drive(case, console, frames=options.frames, every=options.every)
+    if options.command == "verify":
+        from experiments.verify.command import QUICK, SOLVER, verify
+
+        return verify(
+            options.out,
+            states=QUICK if options.quick else options.states,
+            seed=options.seed,
+            workers=options.workers,
+            solver=options.solver or SOLVER,
+            console=console,
+        )
     return _trajectories(options, console)
 
 
