@@ -24,7 +24,6 @@ class StandIn:
         self.problem = problem
         self.damping = (0.3, 0.2)
         self.iterations = iterations
-        self.exact = FatropSolver(problem, tolerance=1e-7)
 
     def step(self, states: Array, inputs: Array) -> Array:
         """One period from each of states (6, n) with inputs (2, n)."""
@@ -64,58 +63,69 @@ class StandIn:
     def solve_qp(
         self, state: Array, last_input: Array, reference: Array, weights: Array, inputs: Array
     ) -> tuple[Status, Array]:
-        """Condensed: every x_i is an affine function of the inputs, which qpOASES then chooses."""
+        """Condensed: every x_i is an affine function of the inputs, which qpOASES then chooses.
+
+        Variables: the moves w = u - inputs (2 N), the slacks (3 N).
+        """
         problem, n = self.problem, self.problem.horizon
-        along = self.linearise(state, inputs)
-        q, s, r = weights[:4], weights[4:8], weights[8:]
-        v = ca.SX.sym("v", 2 * n)
-        slack = ca.SX.sym("slack", 3 * n)
-        influence = np.zeros((n + 1, 6, 2 * n))  # dx_i / du
+        car, along = problem.vehicle, self.linearise(state, inputs)
+        influence = np.zeros((n + 1, 6, 2 * n))  # dx_i / dw
         for i in range(n):
             influence[i + 1] = along.A[i] @ influence[i]
             influence[i + 1][:, 2 * i : 2 * i + 2] = along.B[i]
-        offset = v - inputs.ravel()
-        x = [along.states[i] + ca.mtimes(ca.DM(influence[i]), offset) for i in range(n + 1)]
-        car = problem.vehicle
-        cost: Any = 0
-        rows, low, high = [], [], []
+        outputs = influence[1:][:, OUTPUTS].reshape(4 * n, 2 * n)
+        prices = np.concatenate([np.tile(weights[:4], n - 1), weights[4:8]])
+        effort = np.tile(weights[8:], n)
+        error = (reference[1:] - along.states[1:][:, OUTPUTS]).ravel()
+        moves = outputs.T @ (prices[:, None] * outputs)
+        moves += np.diag(effort + np.tile(self.damping, n))
+        hessian = np.zeros((5 * n, 5 * n))
+        hessian[: 2 * n, : 2 * n] = moves
+        hessian[2 * n :, 2 * n :] = np.diag(np.tile(problem.quadratic_penalty, n))
+        gradient = np.concatenate(
+            [effort * inputs.ravel() - outputs.T @ (prices * error),
+             np.tile(problem.linear_penalty, n)]
+        )  # fmt: skip
+
+        unit = np.eye(2 * n)
+        change = unit - np.vstack([np.zeros((2, 2 * n)), unit[:-2]])
+        before = np.vstack([last_input, inputs[:-1]])
+        rates = np.einsum("ij,ijk->ik", along.rate_x, influence[:-1])
         for i in range(n):
-            u, moved = v[2 * i : 2 * i + 2], offset[2 * i : 2 * i + 2]
-            si = slack[3 * i : 3 * i + 3]
-            error = reference[i + 1] - x[i + 1][OUTPUTS]
-            cost += 0.5 * ca.dot(s if i == n - 1 else q, error**2) + 0.5 * ca.dot(r, u**2)
-            cost += 0.5 * ca.dot(ca.DM(self.damping), moved**2)
-            cost += ca.dot(ca.DM(problem.linear_penalty), si)
-            cost += 0.5 * ca.dot(ca.DM(problem.quadratic_penalty), si**2)
-            rate = along.rate[i] + ca.dot(ca.DM(along.rate_u[i]), moved)
-            rate += ca.dot(ca.DM(along.rate_x[i]), x[i] - along.states[i])
-            vx, vy = x[i + 1][0], x[i + 1][1]
-            ratio = car.max_lateral_velocity_ratio
-            before = last_input if i == 0 else v[2 * i - 2 : 2 * i]
-            for expression, least, most in (
-                (u - before, -problem.input_steps[i], problem.input_steps[i]),
-                (rate + si[2], car.longitudinal_acceleration_range[0], np.inf),
-                (rate - si[2], -np.inf, car.longitudinal_acceleration_range[1]),
-                (vx + si[0], car.speed_range[0], np.inf),
-                (vx - si[0], -np.inf, car.speed_range[1]),
-                (ratio * vx + si[1] - vy, 0.0, np.inf),
-                (ratio * vx + si[1] + vy, 0.0, np.inf),
-            ):
-                rows.append(expression)
-                low.extend(np.broadcast_to(least, expression.shape[0]))
-                high.extend(np.broadcast_to(most, expression.shape[0]))
-        qp = {"x": ca.vertcat(v, slack), "f": cost, "g": ca.vertcat(*rows)}
-        options = {"printLevel": "none", "print_time": False, "error_on_fail": False}
-        solver = ca.qpsol("qp", "qpoases", qp, options)
-        low_u, high_u = problem.input_bounds
+            rates[i, 2 * i : 2 * i + 2] += along.rate_u[i]
+        vx, vy = influence[1:, 0], influence[1:, 1]
+        vx0, vy0 = along.states[1:, 0], along.states[1:, 1]
+        ratio = car.max_lateral_velocity_ratio
+        slacks = [np.eye(3 * n)[k::3] for k in range(3)]
+        free = np.full(n, np.inf)
+        nothing = np.zeros((2 * n, 3 * n))
+        slow, fast = car.speed_range
+        braking, driving = car.longitudinal_acceleration_range
+        blocks = [
+            (change, nothing, *(sign * problem.input_steps.ravel() - (inputs - before).ravel()
+                                for sign in (-1, 1))),
+            (rates, slacks[2], braking - along.rate, free),
+            (rates, -slacks[2], -free, driving - along.rate),
+            (vx, slacks[0], slow - vx0, free),
+            (vx, -slacks[0], -free, fast - vx0),
+            (ratio * vx - vy, slacks[1], vy0 - ratio * vx0, free),
+            (ratio * vx + vy, slacks[1], -vy0 - ratio * vx0, free),
+        ]  # fmt: skip
+        rows = np.vstack([np.hstack(block[:2]) for block in blocks])
+        low_u, high_u = (np.tile(bound, n) - inputs.ravel() for bound in problem.input_bounds)
+        shapes = {"h": ca.Sparsity.dense(*hessian.shape), "a": ca.Sparsity.dense(*rows.shape)}
+        solver = ca.conic("qp", "qpoases", shapes, {"printLevel": "none", "error_on_fail": False})
         result = solver(
-            lbx=np.concatenate([np.tile(low_u, n), np.zeros(3 * n)]),
-            ubx=np.concatenate([np.tile(high_u, n), np.full(3 * n, np.inf)]),
-            lbg=low,
-            ubg=high,
+            h=hessian,
+            g=gradient,
+            a=rows,
+            lba=np.concatenate([block[2] for block in blocks]),
+            uba=np.concatenate([block[3] for block in blocks]),
+            lbx=np.concatenate([low_u, np.zeros(3 * n)]),
+            ubx=np.concatenate([high_u, np.full(3 * n, np.inf)]),
         )
         status = Status.SUCCESS if solver.stats()["success"] else Status.QP_FAILURE
-        return status, np.asarray(result["x"]).ravel()[: 2 * n].reshape(n, 2)
+        return status, inputs + np.asarray(result["x"]).ravel()[: 2 * n].reshape(n, 2)
 
     def solve(
         self,
@@ -126,7 +136,8 @@ class StandIn:
         warm: Any = None,
     ) -> tuple[Solution, Any]:
         if self.iterations > 1:
-            return self.exact.solve(state, last_input, reference, weights, warm)
+            exact = FatropSolver(self.problem, tolerance=1e-6)
+            return exact.solve(state, last_input, reference, weights, warm)
         held = np.tile(last_input, (self.problem.horizon, 1))
         status, inputs = self.solve_qp(state, last_input, reference, weights, held)
         return Solution(status, inputs, None, None, np.nan, 1, 0.0), None

@@ -7,7 +7,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc.casadi_solver import CasadiSolver
 from agents.nmpc.fatrop_solver import FatropSolver
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.registry import agent_class
@@ -20,7 +19,6 @@ from experiments.verify.verdict import SAME
 Array = NDArray[np.float64]
 Measures = dict[str, float | None]
 
-IPOPT_TOLERANCE = 1e-8
 FATROP_TOLERANCE = 1e-7
 ITERATIONS = 200
 """Bound on the iterations after which the solver must have converged."""
@@ -80,7 +78,7 @@ class Bench:
         self.converged: RealTimeSolver = cls(problem, iterations=ITERATIONS)
         self.derivatives = CasadiDerivatives(problem)
         self.piqp = PiqpOracle(problem, self.one_step.damping)
-        self.ipopt = CasadiSolver(problem, tolerance=IPOPT_TOLERANCE)
+        self.ipopt = self.sampler.ipopt
         self.fatrop = FatropSolver(problem, tolerance=FATROP_TOLERANCE)
 
     def measure(self, situation: Situation, *, fatrop: bool) -> Measures:
@@ -123,7 +121,7 @@ class Bench:
         plan = self._price(ours, situation)
         best = self._price(ipopt, situation)
         measures: Measures = {
-            "excess": np.inf if plan is None else plan.excess,
+            "excess": None if plan is None else plan.excess,
             "cost_error": relative(plan, best),
             "suboptimality": self._suboptimality(ours, plan, best, situation),
             "first_input": None,

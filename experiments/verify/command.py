@@ -114,22 +114,24 @@ def _measure(
 
 
 def table(summaries: Sequence[dict[str, Any]]) -> Table:
-    """Distributions and verdicts; `verdict.ROWS` says what is relative and what absolute."""
+    """Distributions and verdicts; `verdict.ROWS` says what is relative and what absolute.
+
+    -/+ counts plans that cost less and more by more than `verdict.SAME`.
+    """
     result = Table(title="magnitude of errors", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    result.add_column("", no_wrap=True)
-    for heading in ("n", "median", "90 %", "99 %", "largest", "goal", "within", "lower/higher"):
+    result.add_column("")
+    for heading in ("n", "median", "90 %", "99 %", "largest", "goal", "within", "-/+"):
         result.add_column(heading, justify="right", no_wrap=True)
-    result.add_column("", no_wrap=True)
     for row in summaries:
         n, within = row["compared"], row["share_within"]
+        verdict = {None: "", True: "[green]", False: "[red]"}[row["holds"]]
         result.add_row(
             row["title"],
             f"{n}" if n == row["of"] else f"{n}/{row['of']}",
             *(number(row[name]) if n else "" for name in QUANTILES),
             "" if row["goal"] is None else f"{row['goal']:.0e}",
-            "" if within is None else f"{100.0 * within:.4g} %",
+            "" if within is None else f"{verdict}{100.0 * within:.4g}%",
             "" if row["lower"] is None else f"{row['lower']}/{row['higher']}",
-            {None: "", True: "[green]holds", False: "[red]missed"}[row["holds"]],
         )
     return result
 

@@ -22,8 +22,9 @@ from lpv_track_env import lpv
 Array = NDArray[np.float64]
 
 STAGE = INPUTS + SOFT + STATES
-TOLERANCE = 1e-10
-"""On residuals and duality gap, absolute and relative to the sizes of their terms."""
+TOLERANCE, GAP = 1e-10, 1e-11
+"""Absolute, on residuals and on the duality gap. Relative ones would not do: a gap of 1e-10 of a
+cost in the thousands leaves the first input 1e-4 from its optimum."""
 
 
 class PiqpOracle:
@@ -63,7 +64,7 @@ class PiqpOracle:
     ) -> Array | None:
         """Inputs (N, 2) of the optimum at the roll-out of `inputs` (N, 2), or None.
 
-        None is what PIQP says it could not solve to `TOLERANCE`.
+        None where PIQP could not solve it to `TOLERANCE` and `GAP`.
         """
         hessian, gradient = self._objective(reference, weights, inputs)
         equal, equal_to = self._dynamics(inputs, along)
@@ -71,8 +72,8 @@ class PiqpOracle:
         lower, upper = self._bounds()
         solver = self._piqp.SparseSolver()
         settings = solver.settings
-        settings.eps_abs = settings.eps_rel = TOLERANCE
-        settings.eps_duality_gap_abs = settings.eps_duality_gap_rel = TOLERANCE
+        settings.eps_abs, settings.eps_rel = TOLERANCE, 0.0
+        settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = GAP, 0.0
         solver.setup(
             sparse.csc_matrix(hessian), gradient, sparse.csc_matrix(equal), equal_to,
             sparse.csc_matrix(rows), low, high, lower, upper,

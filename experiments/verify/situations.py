@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from agents.base import DrivingTask
 from agents.nmpc.agent import IpoptNmpc
+from agents.nmpc.casadi_solver import CasadiSolver
 from agents.reference import steady_turn
 from agents.weights import TrackingWeights
 from experiments.suites import SIX
@@ -18,6 +19,7 @@ from trajectories import load
 
 Array = NDArray[np.float64]
 
+IPOPT_TOLERANCE = 1e-8
 ERRORS = {"lateral_error": 0.5, "heading_error": 0.1, "speed_error": 1.0}
 """Half widths of the uniform errors: m, rad, m/s."""
 WEIGHT_DECADES = 1.0
@@ -60,12 +62,16 @@ class Sampler:
     ----------
     vehicle
         A preset's name.
+
+    Its `agent`, IPOPT's, turns observations into the solvers' parameters; `ipopt` is its solver.
     """
 
     def __init__(self, vehicle: str) -> None:
         self.vehicle = vehicle
         self.env = gymnasium.make(PATH_TRACKING, trajectory=SIX[0], vehicle=vehicle)
-        self.agent = IpoptNmpc(DrivingTask.of(self.env), tolerance=1e-8)
+        self.agent = IpoptNmpc(DrivingTask.of(self.env), tolerance=IPOPT_TOLERANCE)
+        assert isinstance(self.agent.solver, CasadiSolver)
+        self.ipopt = self.agent.solver
 
     def draw(self, index: int, seed: int) -> Situation:
         """Situation number `index`."""
