@@ -346,6 +346,9 @@ def test_a_solver_that_solves_nothing_fails(
     assert code == 1
     wrong = [summary["measure"] for summary in content["summary"] if summary["holds"] is False]
     assert wrong == ["qp_first_input", "excess", "suboptimality"]
+    (case,) = content["situations"]
+    assert case["measures"]["qp_first_input"] == "inf"
+    assert case["measures"]["excess"] is None
     assert capsys.readouterr().out.count("fell short") == 3
 
 

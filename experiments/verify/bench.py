@@ -11,7 +11,7 @@ from agents.nmpc.fatrop_solver import FatropSolver
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.registry import agent_class
 from experiments.verify.cost import PlanCost, plan_cost
-from experiments.verify.derivatives import CasadiDerivatives
+from experiments.verify.derivatives import CasadiDerivatives, Derivatives
 from experiments.verify.qp import PiqpOracle
 from experiments.verify.situations import Sampler, Situation
 from experiments.verify.verdict import SAME
@@ -86,22 +86,20 @@ class Bench:
 
         A solver under test that fails is infinitely wrong.
         """
+        along = self.derivatives.along(situation.state, situation.inputs)
         return {
-            **self._linearisation(situation),
-            **self._qp(situation),
+            **self._linearisation(situation, along),
+            **self._qp(situation, along),
             **self._optimum(situation, fatrop=fatrop),
         }
 
-    def _linearisation(self, situation: Situation) -> Measures:
+    def _linearisation(self, situation: Situation, along: Derivatives) -> Measures:
         ours = self.one_step.linearise(situation.state, situation.inputs)
-        theirs = self.derivatives.along(situation.state, situation.inputs)
         return {
-            name: scaled_error(getattr(ours, name), getattr(theirs, name))
-            for name in theirs._fields
+            name: scaled_error(getattr(ours, name), getattr(along, name)) for name in along._fields
         }
 
-    def _qp(self, situation: Situation) -> Measures:
-        along = self.derivatives.along(situation.state, situation.inputs)
+    def _qp(self, situation: Situation, along: Derivatives) -> Measures:
         state, last, reference, weights = situation.parameters
         theirs = self.piqp.solve(last, reference, weights, situation.inputs, along)
         if theirs is None:

@@ -157,9 +157,9 @@ def _work(results: Sequence[dict[str, Any]]) -> str:
 
 
 def _plain(result: dict[str, Any]) -> dict[str, Any]:
-    """A result for JSON: what is not finite is null."""
+    """A result for JSON: null where an oracle had no answer, "inf" where the solver had none."""
     measures = {
-        name: value if value is not None and math.isfinite(value) else None
+        name: value if value is None or math.isfinite(value) else "inf"
         for name, value in result["measures"].items()
     }
     kept = {key: result[key] for key in ("index", "trajectory", "vehicle", "error")}
