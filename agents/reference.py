@@ -96,9 +96,7 @@ def local_reference(observation: TrackingObservation, period: float) -> LocalRef
 
 
 @compiled
-def fill_nodes(
-    curvature: Array, first_speed: Any, speed: Array, period: Any, nodes: Array
-) -> None:
+def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, nodes: Array) -> None:
     """Fill nodes (n + 1, NODE) from the first n intervals of one preview."""
     s = x = y = heading = 0.0
     before = first_speed

@@ -78,9 +78,9 @@ def run_benchmark(
     return store
 
 
-def _run(specs: Sequence[Spec], store: ResultStore, workers: int, console: Console) -> None:
-    workers = min(workers, len(specs))
-    progress = Progress(
+def progress_bar(console: Console) -> Progress:
+    """Bar with counts and times; nothing where the console is no terminal."""
+    return Progress(
         SpinnerColumn(),
         TextColumn("{task.description}"),
         BarColumn(),
@@ -91,6 +91,11 @@ def _run(specs: Sequence[Spec], store: ResultStore, workers: int, console: Conso
         console=console,
         disable=not console.is_terminal,
     )
+
+
+def _run(specs: Sequence[Spec], store: ResultStore, workers: int, console: Console) -> None:
+    workers = min(workers, len(specs))
+    progress = progress_bar(console)
     began = time.perf_counter()
     with progress:
         bar = progress.add_task("cases", total=len(specs))

@@ -115,6 +115,22 @@ def parser() -> argparse.ArgumentParser:
         help="single, vector, learning, solvers, horizons, batches, memory, startup (default: all)",
     )  # fmt: skip
     speed.add_argument("--quick", action="store_true", help="tiny: shows that it works, no more")
+
+    verify = add(
+        "verify",
+        "Check the real-time NMPC against independent solvers, models and derivatives.",
+        "lpv-track verify --states 200 --out results/verify",
+    )
+    verify.add_argument("--states", type=int, default=1000, metavar="N", help="default 1000")
+    verify.add_argument("--quick", action="store_true", help="24 states, whatever --states says")
+    verify.add_argument("--seed", type=int, default=0)
+    verify.add_argument(
+        "--solver", metavar="MODULE:CLASS", help="default: the real-time solver of lpv-nmpc"
+    )
+    verify.add_argument("--out", type=Path, default=Path("results/verify"), metavar="DIR")
+    verify.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores"
+    )
     return root
 
 
@@ -166,6 +182,17 @@ def run(options: argparse.Namespace) -> int:
             markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
         return 0 if complete else EXIT_INTERRUPTED
+    if options.command == "verify":
+        from experiments.verify.command import QUICK, SOLVER, verify
+
+        return verify(
+            options.out,
+            states=QUICK if options.quick else options.states,
+            seed=options.seed,
+            workers=options.workers,
+            solver=options.solver or SOLVER,
+            console=console,
+        )
     return _trajectories(options, console)
 
 

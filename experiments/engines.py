@@ -61,8 +61,11 @@ def local_pool(
     workers: int,
     run: Run = run_case,
     started: Callable[[Spec], None] | None = None,
+    died: Run = worker_death,
 ) -> Iterator[Result]:
     """Run cases over `workers` processes and yield results as they end.
+
+    `died` makes the result of a case that killed its worker twice.
 
     Raises
     ------
@@ -83,7 +86,7 @@ def local_pool(
             continue
         running, waiting = unfinished
         if alone and running:
-            yield worker_death(running[0])
+            yield died(running[0])
         else:
             suspects += running
 

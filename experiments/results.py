@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from trajectories.atomic import write_atomically
 
 PACKAGES = ("lpv-track-env", "numpy", "scipy", "numba", "casadi", "gymnasium")
-OPTIONAL_PACKAGES = ("torch", "stable-baselines3", "highway-env")
+OPTIONAL_PACKAGES = ("torch", "stable-baselines3", "highway-env", "piqp")
 
 Array = NDArray[np.float64]
 

@@ -8,13 +8,17 @@ from numpy.typing import NDArray
 
 from agents.base import DrivingTask
 from agents.nmpc.base import Ladder, NmpcAgent
-from agents.nmpc.casadi_solver import CasadiSolver, WarmStart
+from agents.nmpc.casadi_solver import CasadiSolver
+from agents.nmpc.fatrop_solver import FatropSolver
 from agents.nmpc.problem import Solution, Status
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import TrackingObservation
+from lpv_track_env.task import choose
 from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]
+
+SOLVERS = ("ipopt", "fatrop")
 
 
 @dataclass
@@ -22,7 +26,8 @@ class NmpcMemory:
     """What the NMPC remembers of one vehicle."""
 
     ladder: Ladder
-    warm: WarmStart | None = None
+    warm: Any = None
+    """What the solver's last call returned for its next."""
     plan: Array | None = None
     """Inputs (N, 2) of the last plan that was solved."""
     age: int = 0
@@ -52,9 +57,12 @@ class IpoptNmpc(NmpcAgent[NmpcMemory]):
     linear_penalty, quadratic_penalty
         Prices of slack on (vx, vy, vx'), see `NmpcProblem`.
     tolerance, max_seconds
-        IPOPT's tolerance and the limit on one solve, s. The default is far above any solve, which
-        100 iterations bound: results must not depend on how busy the machine is. Lower it to
-        drive by the clock.
+        The solver's tolerance, and IPOPT's limit on one solve, s. The default is far above any
+        solve, which 100 iterations bound: results must not depend on how busy the machine is. Lower
+        it to drive by the clock. fatrop has no limit but 200 iterations.
+    solver
+        "ipopt", or "fatrop" where CasADi was built with it: the same problem, exact as well, its
+        stages exploited.
     max_failures
         Failed solves in a row after which the vehicle is brought to a stop.
 
@@ -81,6 +89,7 @@ class IpoptNmpc(NmpcAgent[NmpcMemory]):
         tolerance: float = 1e-6,
         max_seconds: float = 20.0,
         max_failures: int = 10,
+        solver: str = "ipopt",
     ) -> None:
         super().__init__(
             task,
@@ -92,7 +101,11 @@ class IpoptNmpc(NmpcAgent[NmpcMemory]):
             quadratic_penalty=quadratic_penalty,
             max_failures=max_failures,
         )
-        self.solver = CasadiSolver(self.problem, tolerance=tolerance, max_seconds=max_seconds)
+        self.solver: CasadiSolver | FatropSolver
+        if choose("solver", solver, SOLVERS) == "fatrop":
+            self.solver = FatropSolver(self.problem, tolerance=tolerance)
+        else:
+            self.solver = CasadiSolver(self.problem, tolerance=tolerance, max_seconds=max_seconds)
 
     def new_memory(self) -> NmpcMemory:
         """Nothing solved yet."""

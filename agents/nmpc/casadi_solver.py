@@ -186,13 +186,39 @@ class CasadiSolver:
         `reference` is (N + 1, 4). `warm` is what the last solve returned; it is shifted by one
         period here. Never raises: what goes wrong is in the status.
         """
-        n = self.problem.horizon
         began = time.perf_counter()
+        if warm is None:
+            guess, solver = self._cold(state, last_input), self._cold_solver
+        else:
+            guess, solver = self._shifted(warm), self._warm_solver
         parameters = np.concatenate([state, last_input, reference.ravel(), weights])
+        return self._run(solver, guess, parameters, began)
+
+    def solve_from(
+        self, plan: Solution, state: Array, last_input: Array, reference: Array, weights: Array
+    ) -> Solution:
+        """Solve as `solve` does, from another solver's plan for the same situation.
+
+        An optimum is kept: so it tells a second local optimum from a plan that is none.
+
+        Raises
+        ------
+        ValueError
+            If the solution holds no plan.
+        """
+        if plan.inputs is None or plan.states is None or plan.slack is None:
+            raise ValueError(f"there is no plan to start from: status {plan.status.value}")
+        began = time.perf_counter()
+        guess = {"x0": np.column_stack([plan.inputs, plan.slack, plan.states[1:]]).ravel()}
+        parameters = np.concatenate([state, last_input, reference.ravel(), weights])
+        return self._run(self._warm_solver, guess, parameters, began)[0]
+
+    def _run(
+        self, solver: ca.Function, guess: dict[str, Array], parameters: Array, began: float
+    ) -> tuple[Solution, "WarmStart | None"]:
+        n = self.problem.horizon
         if not np.isfinite(parameters).all():
             return Solution(Status.NAN, None, None, None, np.nan, 0, 0.0), None
-        solver = self._cold_solver if warm is None else self._warm_solver
-        guess = self._cold(state, last_input) if warm is None else self._shifted(warm)
         try:
             result = solver(p=parameters, **self._bounds, **guess)
             statistics = solver.stats()
@@ -211,7 +237,7 @@ class CasadiSolver:
         plan = Solution(
             status,
             stages[:, :INPUTS].copy(),
-            np.vstack([state, stages[:, INPUTS + SOFT :]]),
+            np.vstack([parameters[:STATES], stages[:, INPUTS + SOFT :]]),
             stages[:, INPUTS : INPUTS + SOFT].copy(),
             float(result["f"]),
             iterations,

@@ -487,7 +487,9 @@ def solve_qp(
             if mu <= tolerance and share * worst <= tolerance:
                 return _finish(t, inputs, last, limits, slack, OPTIMAL), iterations
             if iterations >= MAX_ITERATIONS:
-                return _finish(t, inputs, last, limits, slack, OUT_OF_ITERATIONS), iterations
+                good = mu <= ACCEPTABLE and share * worst <= ACCEPTABLE
+                code = OPTIMAL if good else OUT_OF_ITERATIONS
+                return _finish(t, inputs, last, limits, slack, code), iterations
             phase = PREDICTING
             continue
         tries += 1

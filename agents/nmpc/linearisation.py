@@ -213,4 +213,6 @@ def unpacked(states: Array, records: Array) -> Linearisation:
     for k in range(2):
         b_matrices[:, :, k] = records[:, 20 + 6 * k : 26 + 6 * k]
     rate_u[:, 1] = records[:, RATE_DELTA]
-    return Linearisation(states.copy(), a_matrices, b_matrices, records[:, RATE].copy(), rate_x, rate_u)
+    return Linearisation(
+        states.copy(), a_matrices, b_matrices, records[:, RATE].copy(), rate_x, rate_u
+    )

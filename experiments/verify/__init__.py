@@ -1,0 +1,1 @@
+"""`lpv-track verify`: the real-time solver against independent solvers, models and derivatives."""
