@@ -1,6 +1,5 @@
 """`lpv_track_env/PathTracking-v0`: drive a reference path with acceleration and steering."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from math import isfinite

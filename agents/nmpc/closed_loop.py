@@ -63,7 +63,7 @@ def drive_rows(
     first: int, last: int, periods: int, memories: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, bound: Array, weights: Array,
     constants: Array, plans: Array, flags: Array, told: Array, states: Array, actions: Array,
-    low: Array, high: Array, progress: Array, given: Array, tally: Array, trace: Array, work: Array,
+    progress: Array, given: Array, tally: Array, trace: Array, work: Array,
 ) -> None:  # fmt: skip
     """Drive environments first to last - 1 until `progress` (n,) reaches `periods` or they end.
 
@@ -73,7 +73,6 @@ def drive_rows(
     size = observations.shape[1]
     seen = work[:size]
     inner = work[size:]
-    command = np.empty(2)
     for row in range(first, last):
         own = row if weights.shape[0] > 1 else 0
         memory, case = memories[row], cases[row]
@@ -94,12 +93,9 @@ def drive_rows(
                 if code != rti.SUCCESS:
                     sums[FAILED] += 1.0
                     break
-            # As `predict` hands it out: float32, within the action space.
-            for j in range(2):
-                command[j] = min(max(np.float32(actions[row, j]), low[j]), high[j])
             before_a, before_delta = memory[k.ACCELERATION], memory[k.STEERING]
             ends[row] = k.step(
-                memory, command, env_constants[case], table, bound, observations[row]
+                memory, actions[row], env_constants[case], table, bound, observations[row]
             )
             if trace.shape[1] > 0:
                 trace[row, progress[row]] = memory
@@ -125,14 +121,14 @@ def drive_in_threads(
     chunks: int, n: int, periods: int, memories: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, bound: Array, weights: Array,
     constants: Array, plans: Array, flags: Array, told: Array, states: Array, actions: Array,
-    low: Array, high: Array, progress: Array, given: Array, tally: Array, trace: Array, work: Array,
+    progress: Array, given: Array, tally: Array, trace: Array, work: Array,
 ) -> None:  # fmt: skip
     """`drive_rows` on all n, in chunks that threads share; `work` is (chunks, room)."""
     for chunk in numba.prange(chunks):
         drive_rows(
             chunk * n // chunks, (chunk + 1) * n // chunks, periods, memories, observations, ends,
             cases, env_constants, tables, rows, bound, weights, constants, plans, flags, told,
-            states, actions, low, high, progress, given, tally, trace, work[chunk],
+            states, actions, progress, given, tally, trace, work[chunk],
         )  # fmt: skip
 
 
@@ -232,10 +228,9 @@ class ClosedLoop:
         progress, given = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.bool_)
         tally = np.zeros((n, TALLY))
         memory, arrays = self.memory, self.envs.arrays
-        space = self.envs.single_action_space
         arguments = (
             periods, *arrays, sets, self.agent.solver.constants, memory.plans, memory.flags,
-            memory.told, memory.states, memory.actions, space.low, space.high, progress, given,
+            memory.told, memory.states, memory.actions, progress, given,
             tally, trace,
         )  # fmt: skip
         while True:
@@ -259,7 +254,7 @@ class ClosedLoop:
 
     def _checked_weights(self, weights: ArrayLike | None) -> Array:
         if weights is None:
-            return self.agent.fixed_weights[np.newaxis]
+            return self.agent.fixed_weights
         values = np.atleast_2d(np.asarray(weights, dtype=np.float64))
         n = self.envs.num_envs
         if values.shape not in {(1, 10), (n, 10)}:

@@ -380,7 +380,7 @@ def expand(
                 ds = (top[i] - w1 * right[i] - w2 * left[i]) * bottom[i]
                 dt[own, i], dt[first, i], dt[second, i] = ds, ds + right[i], ds + left[i]
     for k in range(PAIRS):
-        tk, lk, dtk, dlk, ik = t[k], lam[k], dt[k], dlam[k], inverse[k]
+        lk, dtk, dlk, ik = lam[k], dt[k], dlam[k], inverse[k]
         wk, bk, rk = weight[k], base[k], residual[k]
         for i in range(n):
             # base holds w share residual, which dt has taken off again.

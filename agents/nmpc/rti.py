@@ -1,6 +1,6 @@
 """The NMPC's real-time iteration, compiled: one linearisation and one program a control period.
 
-`solve` is the whole solver for one vehicle; `control` is the agent's step for rows of observations.
+`solve` is the solver for one vehicle; `control` is the agent's step for rows of observations.
 Diehl, Bock and Schloeder, "A real-time iteration scheme for nonlinear optimization in optimal
 feedback control", SIAM J. Control Optim. 43, 2005; the plan is rolled out from the state as
 measured, so it is feasible for the dynamics before every program.
@@ -9,27 +9,23 @@ measured, so it is feasible for the dynamics before every program.
 import math
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from agents.nmpc.interior_point import (
     HIGH_A,
-    HIGH_RATE,
-    HIGH_SPEED,
     LIMITS_SIZE,
     LINEAR,
     LOW_A,
-    LOW_RATE,
-    LOW_SPEED,
     MAX_DELTA,
     OPTIMAL,
     OUT_OF_ITERATIONS,
     QUADRATIC,
-    RATIO,
     clamp,
     solve_qp,
     workspace_size,
 )
-from agents.nmpc.linearisation import RECORD, SCRATCH, differentiate_along, roll_out
+from agents.nmpc.linearisation import RECORD, SCRATCH, differentiate_along
 from agents.reference import NODE, fill_nodes
 from lpv_track_env.bicycle import (
     PSI,
@@ -38,8 +34,6 @@ from lpv_track_env.bicycle import (
     YAW_RATE,
     X,
     Y,
-    compiled_field,
-    compiled_inverse_speed,
 )
 from lpv_track_env.kernels import PREVIEW_START
 from trajectories.compilation import compiled, compiled_in_place
@@ -48,7 +42,16 @@ Array = NDArray[Any]
 Float = Any
 
 # Numbers of a solver, (CONSTANTS_SIZE,): 7 of the model, then these, then the program's limits.
-STEP, SUBSTEPS, PERIOD, SHIFT, TOLERANCE, ITERATIONS, LIMITS = 7, 8, 9, 10, 11, 12, 13
+STEP, SUBSTEPS, PERIOD, SHIFT, TOLERANCE, SPACE_LOW, SPACE_HIGH, LIMITS = (
+    7,
+    8,
+    9,
+    10,
+    11,
+    12,
+    14,
+    16,
+)
 CONSTANTS_SIZE = LIMITS + LIMITS_SIZE
 
 SUCCESS, MAXITER, NOT_FINITE, QP_FAILURE = range(4)
@@ -62,16 +65,11 @@ WARM, PLANNED, AGE, FAILURES = range(4)
 """Flags of a row, (FLAGS,): whether its plan warm-starts, is there at all, its age, failures."""
 FLAGS = 4
 
-STEP_TOLERANCE = 1e-10
-"""Largest change of an input at which an iterated solve has converged."""
-ARMIJO = 1e-4
-SHORTEST_STEP = 1e-6
-
 
 @compiled
 def space(n: int) -> int:
     """Length of the working space of `solve` for N = n."""
-    return workspace_size(n) + RECORD * n + SCRATCH + 6 * (n + 1) + 4 * n + 3 * n
+    return workspace_size(n) + RECORD * n + SCRATCH + 6 * (n + 1) + 2 * n
 
 
 @compiled
@@ -84,57 +82,37 @@ def shift(plan: Array, share: Float) -> None:
 
 
 @compiled
-def evaluate(
-    states: Array, inputs: Array, reference: Array, weights: Array, constants: Array
+def cost_of(
+    states: Array, inputs: Array, slack: Array, reference: Array, weights: Array, limits: Array
 ) -> Float:
-    """Cost of the problem for inputs (N, 2) and their states (N + 1, 6), penalties included."""
-    n, p, limits = inputs.shape[0], constants, constants[LIMITS:]
+    """Cost of the problem at states (N + 1, 6), inputs (N, 2) and slack (3, N)."""
+    n = inputs.shape[0]
     total = 0.0
     for i in range(n + 1):
         offset = 4 if i == n else 0
         x, y = states[i], reference[i]
         e0, e1, e2, e3 = x[VX] - y[0], x[PSI] - y[1], x[X] - y[2], x[Y] - y[3]
-        total += 0.5 * (
-            weights[offset] * e0 * e0
-            + weights[offset + 1] * e1 * e1
-            + weights[offset + 2] * e2 * e2
-            + weights[offset + 3] * e3 * e3
-        )
+        total += weights[offset] * e0 * e0 + weights[offset + 1] * e1 * e1
+        total += weights[offset + 2] * e2 * e2 + weights[offset + 3] * e3 * e3
     for i in range(n):
-        a, delta, x = inputs[i, 0], inputs[i, 1], states[i]
-        total += 0.5 * (weights[8] * a * a + weights[9] * delta * delta)
-        rate = compiled_field(
-            x[VX], x[VY], x[YAW_RATE], 1.0, 0.0, a, delta, math.cos(delta), math.sin(delta),
-            compiled_inverse_speed(x[VX]), p[0], p[1], p[2], p[3], p[4], p[5], p[6],
-        )[0]  # fmt: skip
-        vx, vy = states[i + 1, VX], states[i + 1, VY]
-        total += _penalty(max(limits[LOW_SPEED] - vx, vx - limits[HIGH_SPEED]), 0, limits)
-        total += _penalty(max(limits[LOW_RATE] - rate, rate - limits[HIGH_RATE]), 1, limits)
-        total += _penalty(abs(vy) - limits[RATIO] * vx, 2, limits)
-    return total
+        a, delta = inputs[i, 0], inputs[i, 1]
+        total += weights[8] * a * a + weights[9] * delta * delta
+        for soft in range(3):
+            s = slack[soft, i]
+            total += s * (2.0 * limits[LINEAR + soft] + limits[QUADRATIC + soft] * s)
+    return 0.5 * total
 
 
 @compiled
-def _penalty(excess: Float, soft: int, limits: Array) -> Float:
-    slack = max(excess, 0.0)
-    return slack * (limits[LINEAR + soft] + 0.5 * limits[QUADRATIC + soft] * slack)
-
-
-@compiled_in_place
-def solve(
+def iterate(
     state: Array, last: Array, reference: Array, weights: Array, constants: Array, plan: Array,
-    states: Array, told: Array, work: Array,
+    states: Array, inputs: Array, slack: Array, told: Array, work: Array,
 ) -> int:  # fmt: skip
-    """Improve `plan` (N, 2) for a state (6,) and the input in force `last` (2,), in place.
+    """Linearise along `plan` (N, 2), rolled out from `state` (6,), and solve the program.
 
-    One real-time iteration takes the program's solution as it is. With more than one (the
-    constants' ITERATIONS), steps are shortened until the exact cost falls, and iterations end once
-    the plan no longer changes. Fills states (N + 1, 6) with the prediction and `told` (TOLD,).
-    Returns the code; on any but SUCCESS the plan is not to be used.
+    Fills the solution: states (N + 1, 6), inputs (N, 2), slack (3, N). Adds to `told`.
     """
     n = plan.shape[0]
-    limits = constants[LIMITS:]
-    h, substeps = constants[STEP], int(constants[SUBSTEPS])
     at = workspace_size(n)
     inner = work[:at]
     records = work[at : at + RECORD * n].reshape(n, RECORD)
@@ -142,71 +120,49 @@ def solve(
     scratch = work[at : at + SCRATCH]
     at += SCRATCH
     base = work[at : at + 6 * (n + 1)].reshape(n + 1, 6)
-    at += 6 * (n + 1)
-    inputs = work[at : at + 2 * n].reshape(n, 2)
-    at += 2 * n
-    trial = work[at : at + 2 * n].reshape(n, 2)
-    at += 2 * n
-    slack = work[at : at + 3 * n].reshape(3, n)
-    told[INNER], told[OUTER], told[COST] = 0.0, 0.0, math.nan
-    told[SLACK] = told[SLACK + 1] = told[SLACK + 2] = 0.0
-
-    clamp(plan, last, limits)
     for k in range(6):
         base[0, k] = state[k]
-    iterations = int(constants[ITERATIONS])
-    cost = math.inf
-    for iteration in range(iterations):
-        differentiate_along(plan, constants, h, substeps, base, records, scratch)
-        code, steps = solve_qp(
-            records, base, plan, last, reference, weights, limits, constants[TOLERANCE], states,
-            inputs, slack, inner,
-        )  # fmt: skip
-        told[INNER] += steps
-        told[OUTER] += 1.0
-        if code == OUT_OF_ITERATIONS:
-            return _finish(told, MAXITER)
-        if code != OPTIMAL:
-            return _finish(told, QP_FAILURE)
-        if iterations == 1:
-            for i in range(n):
-                plan[i, 0], plan[i, 1] = inputs[i, 0], inputs[i, 1]
-            break
-        largest = 0.0
-        for i in range(n):
-            largest = max(largest, abs(inputs[i, 0] - plan[i, 0]), abs(inputs[i, 1] - plan[i, 1]))
-        # Length 0 first, for the cost of the plan as it stands.
-        length, found = 0.0 if iteration == 0 else 1.0, math.inf
-        while True:
-            for i in range(n):
-                trial[i, 0] = plan[i, 0] + length * (inputs[i, 0] - plan[i, 0])
-                trial[i, 1] = plan[i, 1] + length * (inputs[i, 1] - plan[i, 1])
-            roll_out(trial, constants, h, substeps, states)
-            found = evaluate(states, trial, reference, weights, constants)
-            if length == 0.0:
-                cost, length = found, 1.0
-                continue
-            if found <= cost or length < SHORTEST_STEP:
-                break
-            length *= 0.5
-        if found <= cost:
-            cost = found
-            for i in range(n):
-                plan[i, 0], plan[i, 1] = trial[i, 0], trial[i, 1]
-        if largest <= STEP_TOLERANCE or not found <= cost:
-            break
-    for soft in range(3):
-        for i in range(n):
-            told[SLACK + soft] = max(told[SLACK + soft], slack[soft, i])
-    if iterations == 1:
-        cost = evaluate(states, plan, reference, weights, constants)
-    told[COST] = cost
-    return _finish(told, SUCCESS if math.isfinite(cost) else NOT_FINITE)
+    differentiate_along(
+        plan, constants, constants[STEP], int(constants[SUBSTEPS]), base, records, scratch
+    )
+    code, steps = solve_qp(
+        records, base, plan, last, reference, weights, constants[LIMITS:], constants[TOLERANCE],
+        states, inputs, slack, inner,
+    )  # fmt: skip
+    told[INNER] += steps
+    told[OUTER] += 1.0
+    if code == OPTIMAL:
+        return SUCCESS
+    return MAXITER if code == OUT_OF_ITERATIONS else QP_FAILURE
 
 
 @compiled
-def _finish(told: Array, code: int) -> int:
+def solve(
+    state: Array, last: Array, reference: Array, weights: Array, constants: Array, plan: Array,
+    states: Array, slack: Array, told: Array, work: Array,
+) -> int:  # fmt: skip
+    """One real-time iteration: improve `plan` (N, 2) in place.
+
+    `state` (6,), `last` (2,) the input in force, reference (N + 1, >= 4), weights (10,). Fills
+    states (N + 1, 6) and slack (3, N) with the program's prediction and `told` (TOLD,). Returns the
+    code; on any but SUCCESS the plan is not to be used.
+    """
+    n = plan.shape[0]
+    inputs = work[: 2 * n].reshape(n, 2)
+    told[INNER], told[OUTER], told[COST] = 0.0, 0.0, math.nan
+    told[SLACK] = told[SLACK + 1] = told[SLACK + 2] = 0.0
+    clamp(plan, last, constants[LIMITS:])
+    code = iterate(
+        state, last, reference, weights, constants, plan, states, inputs, slack, told, work[2 * n :]
+    )
     told[CODE] = code
+    if code != SUCCESS:
+        return code
+    for i in range(n):
+        plan[i, 0], plan[i, 1] = inputs[i, 0], inputs[i, 1]
+        for soft in range(3):
+            told[SLACK + soft] = max(told[SLACK + soft], slack[soft, i])
+    told[COST] = cost_of(states, plan, slack, reference, weights, constants[LIMITS:])
     return code
 
 
@@ -253,6 +209,8 @@ def control_row(
     reference = work[at : at + NODE * (n + 1)].reshape(n + 1, NODE)
     at += NODE * (n + 1)
     trial = work[at : at + 2 * n].reshape(n, 2)
+    at += 2 * n
+    slack = work[at : at + 3 * n].reshape(3, n)
     code = NOT_FINITE
     if situation(observation, constants, state, last, reference):
         for i in range(n):
@@ -262,7 +220,7 @@ def control_row(
                 trial[i, 0], trial[i, 1] = last[0], last[1]
         if flags[WARM] > 0:
             shift(trial, constants[SHIFT])
-        code = solve(state, last, reference, weights, constants, trial, states, told, work)
+        code = solve(state, last, reference, weights, constants, trial, states, slack, told, work)
     else:
         told[CODE], told[INNER], told[OUTER], told[COST] = NOT_FINITE, 0.0, 0.0, math.nan
         told[SLACK] = told[SLACK + 1] = told[SLACK + 2] = 0.0
@@ -274,14 +232,23 @@ def control_row(
     for i in range(n):
         plan[i, 0], plan[i, 1] = trial[i, 0], trial[i, 1]
     flags[WARM], flags[PLANNED], flags[AGE], flags[FAILURES] = 1, 1, 0, 0
-    action[0], action[1] = plan[0, 0], plan[0, 1]
+    bound_action(plan[0, 0], plan[0, 1], constants, action)
     return code
+
+
+@compiled
+def bound_action(a: Float, delta: Float, constants: Array, action: Array) -> None:
+    """Write an action as it is handed out: of float32's precision, within the action space."""
+    low_a, low_delta = constants[SPACE_LOW], constants[SPACE_LOW + 1]
+    high_a, high_delta = constants[SPACE_HIGH], constants[SPACE_HIGH + 1]
+    action[0] = min(max(float(np.float32(a)), low_a), high_a)
+    action[1] = min(max(float(np.float32(delta)), low_delta), high_delta)
 
 
 @compiled
 def room(n: int) -> int:
     """Length of the working space of `control_row` for N = n."""
-    return space(n) + 8 + NODE * (n + 1) + 2 * n
+    return space(n) + 8 + NODE * (n + 1) + 5 * n
 
 
 @compiled

@@ -79,8 +79,6 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         The prediction model and its constraints, by default the task's own vehicle.
     linear_penalty, quadratic_penalty
         Prices of slack on (vx, vy, vx'), see `NmpcProblem`.
-    iterations
-        Linearisations a solve; 1 is the real-time iteration, more iterate towards convergence.
     damping
         Levenberg term on (a, delta), see `RtiSolver`.
     tolerance
@@ -107,7 +105,6 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         model: VehicleParameters | None = None,
         linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),
         quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0),
-        iterations: int = 1,
         damping: tuple[float, float] = DAMPING,
         tolerance: float = 1e-9,
         max_failures: int = 10,
@@ -122,12 +119,15 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             quadratic_penalty=quadratic_penalty,
             max_failures=max_failures,
         )
-        self.solver = RtiSolver(
-            self.problem, iterations=iterations, damping=damping, tolerance=tolerance
-        )
+        self.solver = RtiSolver(self.problem, damping=damping, tolerance=tolerance)
+        self.solver.constants[rti.SPACE_LOW : rti.SPACE_LOW + 4] = [*self._low, *self._high]
         self._work = np.zeros(rti.room(self.problem.horizon))
         self._memory: RtiMemory | None = None
         self._size = task.layout.size
+
+    @property
+    def _rows(self) -> Array:
+        return self._weights.reshape(1, -1)
 
     def control(self, observation: TrackingObservation, memory: RtiRow) -> tuple[float, float]:
         """Inputs for one observation, by `predict`."""
@@ -173,10 +173,10 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             memory = self._new(n)
         if state is None:
             self._memory = memory
-        if episode_start is not None:
-            for row in np.flatnonzero(np.broadcast_to(episode_start, (n,))):
-                memory.clear(int(row))
-        weights = self._weights_of(rows, memory)
+        if episode_start is not None and np.asarray(episode_start).any():
+            for row in np.flatnonzero(np.broadcast_to(episode_start, (n,))).tolist():
+                memory.clear(row)
+        weights = self._rows if self._schedule is None else self._weights_of(rows, memory)
         began = time.perf_counter()
         failed = rti.control(
             rows, weights, self.solver.constants, memory.plans, memory.flags, memory.told,
@@ -188,12 +188,11 @@ class RtiNmpc(NmpcAgent[RtiRow]):
                 rows, memory, np.flatnonzero(memory.told[:, rti.CODE] != rti.SUCCESS)
             )
         actions = memory.actions.astype(np.float32)
-        np.clip(actions, self._low, self._high, out=actions)
         return (actions[0] if single else actions), memory
 
     def _weights_of(self, rows: Array, memory: RtiMemory) -> Array:
-        if self._schedule is None:
-            return self._weights[np.newaxis]
+        """Weights that the schedule chooses for each row, (n, 10)."""
+        assert self._schedule is not None
         weights = np.empty((len(rows), self._weights.size))
         curvature = self.task.layout.unpack(rows).preview_curvature[:, : self.problem.horizon]
         for row, preview in enumerate(curvature):
@@ -206,8 +205,8 @@ class RtiNmpc(NmpcAgent[RtiRow]):
 
     @property
     def fixed_weights(self) -> Array:
-        """Q, S, R in use where no schedule chooses, (10,)."""
-        return self._weights
+        """Q, S, R in use where no schedule chooses, (1, 10)."""
+        return self._rows
 
     def replace_failed(self, rows: Array, memory: RtiMemory, failed: NDArray[np.intp]) -> None:
         """Put what the ladder says in place of the actions of `failed` rows' solves."""
@@ -224,7 +223,8 @@ class RtiNmpc(NmpcAgent[RtiRow]):
                 age,
                 failures,
             )
-            memory.actions[row] = np.nan_to_num(action, nan=0.0)
+            a, delta = np.nan_to_num(action, nan=0.0).tolist()
+            rti.bound_action(a, delta, self.solver.constants, memory.actions[row])
 
     def diagnostics(self, memory: RtiRow) -> dict[str, Any]:
         """Last solve of one vehicle: status, seconds, iterations, cost, slack (3,), plan.

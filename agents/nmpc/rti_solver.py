@@ -5,7 +5,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc import interior_point, linearisation, rti
+from agents.nmpc import interior_point, linearisation, rti, sqp
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import INPUTS, STATES, NmpcProblem, Solution, Status
 
@@ -52,7 +52,8 @@ class RtiSolver:
     problem
         The problem.
     iterations
-        Linearisations a solve: 1 is the real-time iteration.
+        Linearisations a solve: 1 is the real-time iteration, more iterate towards convergence
+        (`sqp`) and stop there.
     damping
         Levenberg term on (a, delta), added to R about the last plan: it costs nothing at
         convergence and keeps full Gauss-Newton steps from cycling.
@@ -91,15 +92,17 @@ class RtiSolver:
                     problem.period,
                     min(first / problem.period, 1.0),
                     tolerance,
-                    iterations,
                 ],
+                np.concatenate(problem.input_bounds).astype(np.float32),
                 limits(problem, self.damping),
             ]
         )
         n = problem.horizon
         self._work = np.zeros(rti.space(n))
         self._told = np.zeros(rti.TOLD)
-        self._states = np.zeros((n + 1, STATES))
+        self._states, self._slack = np.zeros((n + 1, STATES)), np.zeros((3, n))
+        self._scratch = np.zeros((3, n, INPUTS))
+        self._iterations = iterations
 
     def solve(
         self,
@@ -127,23 +130,30 @@ class RtiSolver:
         else:
             plan = warm.copy()
             rti.shift(plan, self.constants[rti.SHIFT])
-        code = rti.solve(
+        situation = (
             np.ascontiguousarray(state, dtype=np.float64), last,
             np.ascontiguousarray(reference, dtype=np.float64),
-            np.ascontiguousarray(weights, dtype=np.float64),
-            self.constants, plan, self._states, self._told, self._work,
+            np.ascontiguousarray(weights, dtype=np.float64), self.constants, plan, self._states,
         )  # fmt: skip
+        if self._iterations == 1:
+            code = rti.solve(*situation, self._slack, self._told, self._work)
+        else:
+            self._told[:] = 0.0
+            inputs, trial, best = self._scratch
+            code = sqp.converge(
+                *situation, inputs, self._slack, trial, best, self._told, self._iterations,
+                self._work,
+            )  # fmt: skip
         seconds = time.perf_counter() - began
         told, status = self._told, STATUS[code]
         iterations = int(told[rti.OUTER])
         if status is not Status.SUCCESS:
             return Solution(status, None, None, None, np.nan, iterations, seconds), None
-        slack = told[rti.SLACK : rti.SLACK + 3][np.array(interior_point.SLACK_OF)]
         solution = Solution(
             status,
             plan,
             self._states.copy(),
-            slack[np.newaxis],
+            self._slack[list(interior_point.SLACK_OF)].T.copy(),
             float(told[rti.COST]),
             iterations,
             seconds,
