@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled, compiled_inline
 from trajectories.interpolation import (
     HEADING,
     SPEED,
@@ -19,7 +19,7 @@ from trajectories.interpolation import (
 )
 
 
-@compiled
+@compiled_inline
 def fill_preview(
     table: Table, length: Float, closed: bool, s: Float, index: int, u: Float, period: Float,
     out: NDArray[Any], first: int, count: int, curvature_bound: Float, speed_bound: Float,
