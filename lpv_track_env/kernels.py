@@ -14,7 +14,7 @@ from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.integration import integrate
 from lpv_track_env.observation import SCALARS
 from lpv_track_env.reward import terms
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled, compiled_inline
 from trajectories.interpolation import cell, saturate, speed_in
 from trajectories.preview import fill_preview
 from trajectories.projection import SEARCH_WINDOW, follow
@@ -94,7 +94,7 @@ def actuate(
     return rated_a, rated_delta, bits
 
 
-@compiled
+@compiled_inline
 def observe(
     memory: Array, constants: Array, table: Array, bound: Array, observation: Array,
     index: int, u: Any,
@@ -116,7 +116,7 @@ def observe(
     )  # fmt: skip
 
 
-@compiled
+@compiled_inline
 def locate(
     memory: Array, constants: Array, table: Array, near: Any, ahead: Any, window: Any
 ) -> tuple[int, Any]:
@@ -137,7 +137,7 @@ def locate(
     return index, u
 
 
-@compiled
+@compiled_inline
 def judge(memory: Array, constants: Array, finite: bool) -> int:
     """How the episode stands: RUNNING or the code of its end."""
     if not finite:
@@ -156,7 +156,7 @@ def judge(memory: Array, constants: Array, finite: bool) -> int:
     return RUNNING
 
 
-@compiled
+@compiled_inline
 def finish(
     memory: Array, constants: Array, table: Array, bound: Array, observation: Array,
     vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, a: Any, delta: Any, bits: int,
@@ -183,8 +183,14 @@ def finish(
         u = offset * (n - 1) / p[LENGTH]
     end = judge(memory, constants, finite)
     failed = end in (LEFT_CORRIDOR, WRONG_HEADING, NON_FINITE)
+    # A tuple, for a slice would be an array with a reference count to keep.
+    w = WEIGHTS
+    weights = (
+        p[w], p[w + 1], p[w + 2], p[w + 3], p[w + 4], p[w + 5], p[w + 6], p[w + 7], p[w + 8],
+        p[w + 9], p[w + 10],
+    )  # fmt: skip
     parts = terms(
-        p[WEIGHTS:], p[PERIOD], memory[ARC_LENGTH] - before,
+        weights, p[PERIOD], memory[ARC_LENGTH] - before,
         memory[LATERAL_ERROR], memory[HEADING_ERROR], memory[SPEED_ERROR],
         memory[REFERENCE_SPEED], (a - last_a) / p[PERIOD], (delta - last_delta) / p[PERIOD], failed,
     )  # fmt: skip

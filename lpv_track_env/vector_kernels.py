@@ -16,7 +16,7 @@ from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.episodes import TRAJECTORY_DRAW, VEHICLE_DRAW, begin, choice
 from lpv_track_env.integration import integrate, per_mass, rotate, runge_kutta
-from trajectories.compilation import compiled, compiled_parallel
+from trajectories.compilation import compiled, compiled_inline, compiled_parallel
 
 Array = NDArray[Any]
 
@@ -55,7 +55,7 @@ def integrate_lanes(b: Array, substeps: int) -> None:
             b[COS + j], b[SIN + j] = c, s
 
 
-@compiled
+@compiled_inline
 def load_lane(b: Array, j: int, memory: Array, action: Array, p: Array) -> int:
     """Copy a vehicle into lane j: state, what its actuators give, parameters; its substeps."""
     a, delta, bits = k.actuate(

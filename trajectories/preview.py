@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled, compiled_inline
 from trajectories.interpolation import (
     HEADING,
     SPEED,
@@ -15,12 +15,11 @@ from trajectories.interpolation import (
     Table,
     cell,
     heading_in,
-    saturate,
     speed_in,
 )
 
 
-@compiled
+@compiled_inline
 def fill_preview(
     table: Table, length: Float, closed: bool, s: Float, index: int, u: Float, period: Float,
     out: NDArray[Any], first: int, count: int, curvature_bound: Float, speed_bound: Float,
@@ -32,7 +31,9 @@ def fill_preview(
     """
     n = table.shape[0]
     h = length / (n - 1)
-    inverse = 1.0 / h
+    inverse, quarter = 1.0 / h, 0.25 * (n - 1) / length
+    # In one type: comparisons of mixed ones cost conversions.
+    curvature_bound, speed_bound = np.float64(curvature_bound), np.float64(speed_bound)
     duration, last_speed = table[n - 1, TIME], table[n - 1, SPEED]
     now = table[index, TIME] + 2.0 * u * h / (table[index, SPEED] + speed_in(table, index, u))
     heading = heading_in(table, h, index, u)
@@ -56,23 +57,22 @@ def fill_preview(
                 end = length + (time - duration) * last_speed
                 next_heading = table[n - 1, HEADING]
                 mean = (next_heading - heading) / max(end - start, 1e-9)
-                out[first + k] = saturate(mean, curvature_bound)
-                out[first + count + k] = saturate(last_speed, speed_bound)
+                out[first + k] = min(max(mean, -curvature_bound), curvature_bound)
+                out[first + count + k] = min(last_speed, speed_bound)
                 start, heading = end, next_heading
                 continue
         # No need to look for the end: the last node's time is beyond `time`.
         while table[index + 1, TIME] <= time:
             index += 1
         v0, v1 = table[index, SPEED], table[index + 1, SPEED]
-        tau = max(time - table[index, TIME], 0.0)
-        half = 0.25 * (v1 * v1 - v0 * v0) * inverse * tau
-        offset = min(tau * (v0 + half), h)
+        tau = time - table[index, TIME]
+        half = quarter * (v1 * v1 - v0 * v0) * tau
+        offset = tau * (v0 + half)
         end = base + (index * h + offset)
         next_heading = turned + heading_in(table, h, index, offset * inverse)
-        out[first + k] = saturate(
-            (next_heading - heading) / max(end - start, 1e-9), curvature_bound
-        )
-        out[first + count + k] = saturate(v0 + 2.0 * half, speed_bound)
+        mean = (next_heading - heading) / max(end - start, 1e-9)
+        out[first + k] = min(max(mean, -curvature_bound), curvature_bound)
+        out[first + count + k] = min(v0 + 2.0 * half, speed_bound)
         start, heading = end, next_heading
 
 

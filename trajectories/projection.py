@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled, compiled_inline
 from trajectories.interpolation import (
     COS,
     CURVATURE,
@@ -56,7 +56,7 @@ def nearest_node(table: Table, closed: bool, x: Float, y: Float, first: int, las
     return best
 
 
-@compiled
+@compiled_inline
 def nearest_node_downhill(
     table: Table, closed: bool, x: Float, y: Float, first: int, last: int, guess: int,
     spacing: Float, tightest: Float,
@@ -93,7 +93,7 @@ def nearest_node_downhill(
     return nearest_node(table, closed, x, y, first, last)
 
 
-@compiled
+@compiled_inline
 def foot_point(
     table: Table, h: Float, closed: bool, x: Float, y: Float, node: int
 ) -> tuple[int, Float, Float]:
@@ -172,7 +172,7 @@ def project(
     return s, lateral_error, heading, curvature_at(table, length, closed, s)
 
 
-@compiled
+@compiled_inline
 def follow(
     table: Table, length: Float, closed: bool, x: Float, y: Float,
     near: Float, ahead: Float, window: Float, tightest: Float,
