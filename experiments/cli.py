@@ -37,7 +37,9 @@ def parser() -> argparse.ArgumentParser:
         "Run agents x trajectories x seeds, print the paper's table, write report.html.",
         "lpv-track benchmark --agents stanley lqr --trajectories T1 T2 --out results/mine",
     )
-    benchmark.add_argument("--suite", default="paper", help="paper (default), quick or sideslip")
+    benchmark.add_argument(
+        "--suite", default="paper", help="paper (default), quick, converged or sideslip"
+    )
     benchmark.add_argument(
         "--agents", nargs="+", metavar="NAME", help="default: all; your own: file.py:Class"
     )
@@ -79,9 +81,9 @@ def parser() -> argparse.ArgumentParser:
     drive = add(
         "drive",
         "Watch one run live, or write its frames.",
-        "lpv-track drive --agent lpv-nmpc-ipopt --trajectory T2 --frames frames --every 4",
+        "lpv-track drive --agent lpv-nmpc --trajectory T2 --frames frames --every 4",
     )
-    drive.add_argument("--agent", default="lpv-nmpc-ipopt", metavar="NAME")
+    drive.add_argument("--agent", default="lpv-nmpc", metavar="NAME")
     drive.add_argument("--trajectory", default="T2", metavar="NAME")
     drive.add_argument("--vehicle", default="m2-minibus", metavar="NAME")
     drive.add_argument("--speed-mode", default="variable", choices=["variable", "fixed"])
@@ -112,7 +114,8 @@ def parser() -> argparse.ArgumentParser:
     speed.add_argument("--out", type=Path, default=Path("results/speed"), metavar="DIR")
     speed.add_argument(
         "--only", nargs="+", default=[], metavar="SECTION",
-        help="single, vector, learning, solvers, horizons, batches, memory, startup (default: all)",
+        help="default: all of single, vector, learning, solvers, horizons, batches, loops, memory, "
+        "startup",
     )  # fmt: skip
     speed.add_argument("--quick", action="store_true", help="tiny: shows that it works, no more")
 

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from experiments.speed import peers
 from experiments.speed.measure import Effort, Run, Section, Tick, calibrated, interleave
+from experiments.speed.numpy_env import NumpyTracking
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.registration import PATH_TRACKING
+from lpv_track_env.vector_env import PathTrackingVectorEnv
 
 OURS = "lpv-track-env"
 BARE = "lpv-track-env without gymnasium's wrappers"
@@ -132,15 +134,8 @@ def _actions(n: int) -> NDArray[np.float32]:
 
 
 def make_vector(n: int, **settings: Any) -> Any:
-    """Our vector environment.
-
-    Raises
-    ------
-    Unavailable
-        Where this version has none.
-    """
-    make = peers.module("lpv_track_env.vector_env").PathTrackingVectorEnv
-    return make(trajectory=TRAJECTORY, num_envs=n, **settings)
+    """Our vector environment."""
+    return PathTrackingVectorEnv(trajectory=TRAJECTORY, num_envs=n, **settings)
 
 
 def ours_vector(n: int, threads: int) -> Run:
@@ -153,13 +148,12 @@ def numpy_vector(n: int) -> Run:
 
     Every round begins from the start of the episode, so that no vehicle gets far from its path.
     """
-    make = peers.module("experiments.speed.numpy_env").NumpyTracking
     env = make_vector(n)
     env.reset(seed=0)
     actions = _actions(n).astype(np.float64)
 
     def run(count: int) -> float:
-        yardstick = make(env.tasks[0], env.memories)
+        yardstick = NumpyTracking(env.tasks[0], env.memories)
         step = yardstick.step
         chosen = list(islice(cycle(actions), count))
         began = time.perf_counter()

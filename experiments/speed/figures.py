@@ -141,11 +141,18 @@ def _batches(section: Result, ax: Axes) -> None:
     ax.set_ylabel("ms per solve")
 
 
+def _loops(section: Result, ax: Axes) -> None:
+    _lines(section, ax, "n", 1e6)
+    _doubling(ax, "environments in a call")
+    ax.set_ylabel("µs per environment and control period")
+
+
 PANELS: dict[str, Callable[[Result, Axes], None]] = {
     "single": _single,
     "vector": _vector,
     "solvers": _solvers,
     "horizons": _horizons,
     "batches": _batches,
+    "loops": _loops,
 }
 """What draws a section."""

@@ -44,10 +44,9 @@ def _ours() -> Any:
     from gymnasium.vector import AutoresetMode
 
     peers.module("stable_baselines3")
-    adapt = getattr(agents, "sb3_vec_env", None)
-    if adapt is None:
-        raise peers.Unavailable(peers.ABSENT)
-    return adapt(environments.make_vector(ENVS, autoreset_mode=AutoresetMode.SAME_STEP))
+    return agents.sb3_vec_env(
+        environments.make_vector(ENVS, autoreset_mode=AutoresetMode.SAME_STEP)
+    )
 
 
 def _in_sequence() -> Any:

@@ -24,8 +24,6 @@ INSTALL = {
     "envpool": "pip install envpool",
 }
 """Optional packages by module, and what installs them."""
-OWN = ("lpv_track_env", "agents", "experiments", "trajectories")
-ABSENT = "not available in this version"
 LANE_KEEPING = {"simulation_frequency": 200, "policy_frequency": 20}
 """Hz: a Runge-Kutta step of 5 ms in its BicycleVehicle, ten to an env step of 50 ms, as ours."""
 SCAN = 64
@@ -37,19 +35,17 @@ class Unavailable(Exception):  # noqa: N818  not an error: said, and gone on
 
 
 def module(name: str) -> Any:
-    """Import a module that may be absent.
+    """Import an optional package's module.
 
     Raises
     ------
     Unavailable
-        Saying how to install it, or that this version of the project has none.
+        Saying how to install it.
     """
     try:
         return importlib.import_module(name)
     except ImportError as error:
         missing = (error.name or name).partition(".")[0]
-        if missing in OWN:
-            raise Unavailable(ABSENT) from error
         hint = INSTALL.get(missing, f"pip install {missing}")
         raise Unavailable(f"{missing} is not installed: {hint}") from error
 

@@ -95,35 +95,11 @@ def child(program: str, cache: Path | None = None) -> tuple[float, float]:
     return report["done"] - began, float(report["peak"])
 
 
-def _absent(program: str) -> str | None:
-    """Why this version cannot run a program, or None if it can."""
-    if "vector_env" in program:
-        try:
-            peers.module("lpv_track_env.vector_env")
-        except peers.Unavailable as reason:
-            return str(reason)
-    if "'lpv-nmpc'" in program and "lpv-nmpc" not in agents.names():
-        return peers.ABSENT
-    return None
-
-
-def _possible(section: Section, large: int) -> dict[str, str]:
-    """Programs that this version can run; the section is told of the others."""
-    found = {}
-    for name, program in programs(large).items():
-        reason = _absent(program)
-        if reason is None:
-            found[name] = program
-        else:
-            section.lacks(name, reason)
-    return found
-
-
 def memory(section: Section, effort: Effort, tick: Tick) -> None:
     """Peak resident set of fresh processes, and bytes per environment of a vector env."""
     section.notes.append("Peak resident set of a fresh process that does this and no more.")
     peaks: dict[str, Series] = {}
-    for name, program in _possible(section, effort.large).items():
+    for name, program in programs(effort.large).items():
         peaks[name] = section.add(name, "bytes")
         tick(f"memory: {name}")
         try:
@@ -147,7 +123,7 @@ def startup(section: Section, effort: Effort, tick: Tick) -> None:
         "Seconds from starting a process until this is done. Warm: compiled code is in numba's "
         "cache; cold: that cache is an empty folder, as on the first use after an installation."
     )
-    possible = _possible(section, effort.large)
+    possible = programs(effort.large)
     possible.pop(f"{VECTOR_ENV} of {effort.large}", None)
     for name, program in possible.items():
         try:

@@ -91,8 +91,6 @@ def make(label: str, env: gymnasium.Env[Any, Any], **settings: Any) -> agents.ba
         Where this version has none such.
     """
     name, own = SOLVERS[label]
-    if name not in agents.names():
-        raise peers.Unavailable(peers.ABSENT)
     try:
         return agents.make(name, env, **own, **settings)
     except ValueError as error:

@@ -1,0 +1,66 @@
+"""Section of the closed loop: many environments, each with its NMPC and its weights."""
+
+import time
+
+import numpy as np
+
+import agents
+from agents.nmpc.closed_loop import ClosedLoop
+from experiments.speed.measure import Effort, Run, Section, Tick, calibrated, interleave
+from lpv_track_env.vector_env import PathTrackingVectorEnv
+
+PERIODS = 20
+"""Control periods a call: a decision of a weight policy each second, say."""
+SPREAD = 0.3
+"""Standard deviation of the logarithms of every environment's own weights."""
+ERRORS = (0.3, 0.05, 0.5)
+"""m, rad, m/s: range of the errors that episodes start with."""
+
+
+def loops(section: Section, effort: Effort, tick: Tick) -> None:
+    """Compiled closed loops over the number of environments and threads."""
+    section.notes.append(
+        f"Seconds per control period of one environment, NMPC and plant together: calls of {PERIODS} "
+        f"periods on {' and '.join(effort.trajectories)}, every environment with its own weights, "
+        "started anywhere on its path with some error. Resets stand outside the clock."
+    )
+    for n in effort.batches:
+        pairs = []
+        for threads in effort.threads:
+            if threads > n:
+                continue
+            tick(f"closed loops: {n} environments, {threads} threads")
+            series = section.add("closed loop", "s/period", n=n, threads=threads)
+            loop = closed_loop(effort.trajectories, n, threads)
+            pairs.append((series, calibrated(loop_run(loop), effort.round_seconds)))
+        interleave(pairs, effort.rounds)
+        for series, _ in pairs[1:]:
+            section.compare(series, pairs[0][0])
+
+
+def closed_loop(trajectories: tuple[str, ...], n: int, threads: int) -> ClosedLoop:
+    """n environments with an NMPC each."""
+    envs = PathTrackingVectorEnv(
+        n, list(trajectories), autoreset_mode="Disabled", random_start=True,
+        initial_error_range=ERRORS,
+    )  # fmt: skip
+    agent = agents.make("lpv-nmpc", envs.single)
+    return ClosedLoop(envs, agent, threads=threads)  # type: ignore[arg-type]
+
+
+def loop_run(loop: ClosedLoop) -> Run:
+    """Calls of `drive` on episodes that begin anew each time; seconds per period driven."""
+    n = loop.envs.num_envs
+    spread = np.random.default_rng(0).normal(0.0, SPREAD, (n, 10))
+    weights = loop.agent.fixed_weights * np.exp(spread)
+
+    def run(count: int) -> float:
+        seconds = 0.0
+        for k in range(count):
+            loop.reset(seed=k * n)
+            began = time.perf_counter()
+            tally = loop.drive(PERIODS, weights)
+            seconds += (time.perf_counter() - began) / max(float(tally.steps.sum()), 1.0)
+        return seconds
+
+    return run
