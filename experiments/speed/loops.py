@@ -20,8 +20,8 @@ ERRORS = (0.3, 0.05, 0.5)
 def loops(section: Section, effort: Effort, tick: Tick) -> None:
     """Compiled closed loops over the number of environments and threads."""
     section.notes.append(
-        f"Seconds per control period of one environment, NMPC and plant together: calls of {PERIODS} "
-        f"periods on {' and '.join(effort.trajectories)}, every environment with its own weights, "
+        "Seconds per control period of one environment, NMPC and plant together: calls of "
+        f"{PERIODS} periods on {' and '.join(effort.trajectories)}, every environment with its own weights, "
         "started anywhere on its path with some error. Resets stand outside the clock."
     )
     for n in effort.batches:
@@ -39,7 +39,7 @@ def loops(section: Section, effort: Effort, tick: Tick) -> None:
 
 
 def closed_loop(trajectories: tuple[str, ...], n: int, threads: int) -> ClosedLoop:
-    """n environments with an NMPC each."""
+    """N environments with an NMPC each."""
     envs = PathTrackingVectorEnv(
         n, list(trajectories), autoreset_mode="Disabled", random_start=True,
         initial_error_range=ERRORS,

@@ -13,8 +13,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import agents
-from experiments.speed import peers
 from experiments.speed.measure import Effort, Section, Series, Tick
 
 LIMIT = 300.0
