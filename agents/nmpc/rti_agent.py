@@ -106,7 +106,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),
         quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0),
         damping: tuple[float, float] = DAMPING,
-        tolerance: float = 1e-9,
+        tolerance: float = 1e-12,
         max_failures: int = 10,
     ) -> None:
         super().__init__(

@@ -72,7 +72,7 @@ class RtiSolver:
         *,
         iterations: int = 1,
         damping: tuple[float, float] = DAMPING,
-        tolerance: float = 1e-9,
+        tolerance: float = 1e-12,
     ) -> None:
         if iterations < 1:
             raise ValueError(f"iterations must be at least 1, not {iterations}")
@@ -101,7 +101,6 @@ class RtiSolver:
         self._work = np.zeros(rti.space(n))
         self._told = np.zeros(rti.TOLD)
         self._states, self._slack = np.zeros((n + 1, STATES)), np.zeros((3, n))
-        self._scratch = np.zeros((3, n, INPUTS))
         self._iterations = iterations
 
     def solve(
@@ -130,23 +129,27 @@ class RtiSolver:
         else:
             plan = warm.copy()
             rti.shift(plan, self.constants[rti.SHIFT])
-        situation = (
+        given = (
             np.ascontiguousarray(state, dtype=np.float64), last,
             np.ascontiguousarray(reference, dtype=np.float64),
-            np.ascontiguousarray(weights, dtype=np.float64), self.constants, plan, self._states,
+            np.ascontiguousarray(weights, dtype=np.float64),
         )  # fmt: skip
         if self._iterations == 1:
-            code = rti.solve(*situation, self._slack, self._told, self._work)
+            code = rti.solve(
+                *given, self.constants, plan, self._states, self._slack, self._told, self._work
+            )
+            status, cost = STATUS[code], float(self._told[rti.COST])
+            iterations = int(self._told[rti.OUTER])
         else:
-            self._told[:] = 0.0
-            inputs, trial, best = self._scratch
-            code = sqp.converge(
-                *situation, inputs, self._slack, trial, best, self._told, self._iterations,
-                self._work,
-            )  # fmt: skip
+            status, plan, iterations = sqp.converge(
+                self._bounded(plan, last),
+                lambda about: self.solve_qp(*given, about),
+                lambda inputs: self._price(inputs, *given),
+                lambda inputs: self._bounded(inputs, last),
+                self._iterations,
+            )
+            cost = self._price(plan, *given)
         seconds = time.perf_counter() - began
-        told, status = self._told, STATUS[code]
-        iterations = int(told[rti.OUTER])
         if status is not Status.SUCCESS:
             return Solution(status, None, None, None, np.nan, iterations, seconds), None
         solution = Solution(
@@ -154,11 +157,32 @@ class RtiSolver:
             plan,
             self._states.copy(),
             self._slack[list(interior_point.SLACK_OF)].T.copy(),
-            float(told[rti.COST]),
+            cost,
             iterations,
             seconds,
         )
         return solution, plan
+
+    def _bounded(self, inputs: Array, last: Array) -> Array:
+        bounded = np.ascontiguousarray(inputs, dtype=np.float64)
+        interior_point.clamp(bounded, last, self.constants[rti.LIMITS :])
+        return bounded
+
+    def _price(
+        self,
+        inputs: Array,
+        state: Array,
+        last: Array,
+        reference: Array,
+        weights: Array,  # noqa: ARG002
+    ) -> float:
+        """Exact cost of a plan; its roll-out and slack are left in this solver's arrays."""
+        self._states[0] = state
+        constants = self.constants
+        linearisation.roll_out(
+            inputs, constants, constants[rti.STEP], int(constants[rti.SUBSTEPS]), self._states
+        )
+        return float(sqp.evaluate(self._states, inputs, self._slack, reference, weights, constants))
 
     def linearise(self, state: Array, inputs: Array) -> Linearisation:
         """Roll `inputs` (N, 2) out from `state` (6,) and differentiate along the way."""

@@ -1,24 +1,21 @@
 """The NMPC's problem to convergence, by sequential quadratic programming: not for real time.
 
-Gauss-Newton steps of the real-time iteration, each shortened or lengthened until the exact cost of
-the rolled-out plan falls. Full steps are known to cycle.
+The real-time iteration's map from a plan to its program's solution is iterated. Full Gauss-Newton
+steps are known to cycle, and shortened ones crawl where the residual is large; so steps are mixed
+by Anderson's method (Walker and Ni, "Anderson acceleration for fixed-point iterations", SIAM J.
+Numer. Anal. 49, 2011), taken only where the exact cost falls, and else shortened until it does.
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc.interior_point import (
-    HIGH_RATE,
-    HIGH_SPEED,
-    LOW_RATE,
-    LOW_SPEED,
-    RATIO,
-    clamp,
-)
-from agents.nmpc.linearisation import roll_out
-from agents.nmpc.rti import COST, LIMITS, STEP, SUBSTEPS, SUCCESS, cost_of, iterate
+from agents.nmpc.interior_point import HIGH_RATE, HIGH_SPEED, LOW_RATE, LOW_SPEED, RATIO
+from agents.nmpc.problem import Status
+from agents.nmpc.rti import LIMITS, cost_of
 from lpv_track_env.bicycle import VX, VY, YAW_RATE, compiled_field, compiled_inverse_speed
 from trajectories.compilation import compiled
 
@@ -27,10 +24,12 @@ Float = Any
 
 STEP_TOLERANCE = 1e-11
 """Largest change of an input at which the plan has converged."""
-SHORTEST, LONGEST = 2.0**-20, 2.0**8
-"""Bounds of a step's length."""
-PATIENCE = 5
-"""Steps in a row that may save next to nothing."""
+SHORTEST = 1e-6
+"""Least length of a step."""
+DEPTH = 5
+"""Steps that Anderson's method mixes."""
+PATIENCE = 8
+"""Steps in a row that may save nothing beyond rounding."""
 
 
 @compiled
@@ -52,62 +51,75 @@ def evaluate(
     return cost_of(states, inputs, slack, reference, weights, limits)
 
 
-@compiled
 def converge(
-    state: Array, last: Array, reference: Array, weights: Array, constants: Array, plan: Array,
-    states: Array, inputs: Array, slack: Array, trial: Array, best: Array, told: Array,
-    iterations: int, work: Array,
-) -> int:  # fmt: skip
-    """Improve `plan` (N, 2) in place by at most `iterations` programs; returns the last code.
+    plan: Array,
+    program: Callable[[Array], tuple[Status, Array]],
+    cost: Callable[[Array], float],
+    bound: Callable[[Array], Array],
+    iterations: int,
+) -> tuple[Status, Array, int]:
+    """Iterate a plan, inputs (N, 2) within their limits, until it no longer changes.
 
-    Fills states (N + 1, 6) with the plan's roll-out, slack (3, N) and the cost in `told`. `inputs`,
-    `trial` and `best` (N, 2) are scratch.
+    Parameters
+    ----------
+    plan
+        Where to begin.
+    program
+        Solution of the quadratic program about a plan, and its status.
+    cost
+        Exact cost of a plan.
+    bound
+        A plan brought within the limits of its inputs.
+    iterations
+        Programs at most.
+
+    Returns
+    -------
+    status
+        SUCCESS, or that of a program that failed.
+    plan
+        The best one found.
+    iterations
+        Programs solved.
     """
-    h, substeps, limits = constants[STEP], int(constants[SUBSTEPS]), constants[LIMITS:]
-    clamp(plan, last, limits)
-    for k in range(6):
-        states[0, k] = state[k]
-    cost, idle, first, code = math.inf, 0, 1.0, SUCCESS
-    for _ in range(iterations):
-        code = iterate(
-            state, last, reference, weights, constants, plan, states, inputs, slack, told, work
-        )
-        if code != SUCCESS:
-            return code
-        if math.isinf(cost):
-            roll_out(plan, constants, h, substeps, states)
-            cost = evaluate(states, plan, slack, reference, weights, constants)
-        largest = 0.0
-        for i in range(plan.shape[0]):
-            for k in range(2):
-                largest = max(largest, abs(inputs[i, k] - plan[i, k]))
-        # Double the step while that helps; else halve it until it helps.
-        before, length, growing = cost, first, True
-        while SHORTEST <= length <= LONGEST:
-            for i in range(plan.shape[0]):
-                for k in range(2):
-                    trial[i, k] = plan[i, k] + length * (inputs[i, k] - plan[i, k])
-            clamp(trial, last, limits)
-            roll_out(trial, constants, h, substeps, states)
-            found = evaluate(states, trial, slack, reference, weights, constants)
-            if found < cost:
-                cost, first = found, length
-                best[:] = trial
-                if not growing:
-                    break
-                length *= 2.0
-            elif cost < before:
-                break
-            else:
-                growing = False
-                length *= 0.5
-        if cost < before:
-            plan[:] = best
-        idle = idle + 1 if before - cost <= 1e-14 * abs(before) else 0
-        if largest <= STEP_TOLERANCE or idle >= PATIENCE:
-            break
-        if cost >= before:
-            first = 1.0
-    roll_out(plan, constants, h, substeps, states)
-    told[COST] = evaluate(states, plan, slack, reference, weights, constants)
-    return code
+    price = cost(plan)
+    plans: list[Array] = []
+    steps: list[Array] = []
+    idle = 0
+    for count in range(1, iterations + 1):
+        status, solution = program(plan)
+        if status is not Status.SUCCESS:
+            return status, plan, count
+        step = solution - plan
+        if np.abs(step).max() <= STEP_TOLERANCE:
+            return Status.SUCCESS, plan, count
+        plans, steps = [*plans, plan][-DEPTH:], [*steps, step][-DEPTH:]
+        before = price
+        if len(plans) > 1:
+            mixed = bound(_mixed(plans, steps))
+            found = cost(mixed)
+            if found < price:
+                plan, price = mixed, found
+        length = 1.0
+        while price >= before and length > SHORTEST:
+            shortened = bound(plan + length * step)
+            found = cost(shortened)
+            if found < price:
+                plan, price = shortened, found
+            length *= 0.5
+        if price >= before:
+            if len(plans) == 1:
+                return Status.SUCCESS, plan, count
+            plans, steps = [], []
+        idle = idle + 1 if before - price <= 1e-15 * abs(before) else 0
+        if idle > PATIENCE:
+            return Status.SUCCESS, plan, count
+    return Status.SUCCESS, plan, iterations
+
+
+def _mixed(plans: list[Array], steps: list[Array]) -> Array:
+    """Anderson's next plan: the step that is least, to first order, among mixtures."""
+    changes = np.array([b - a for a, b in zip(steps[:-1], steps[1:], strict=True)])
+    moves = np.array([b - a for a, b in zip(plans[:-1], plans[1:], strict=True)])
+    shares = np.linalg.lstsq(changes.reshape(len(changes), -1).T, steps[-1].ravel(), rcond=1e-10)[0]
+    return plans[-1] + steps[-1] - np.tensordot(shares, moves + changes, axes=1)
