@@ -62,8 +62,8 @@ HELD = 1e-9
 SLIGHT = 1e-9
 STIFFNESS = 1e7
 MAX_ITERATIONS = 40
-START_BARRIER = 1.0
-START_DISTANCE = 0.5
+START_BARRIER = 300.0
+START_DISTANCE = 1.0
 """Least t at the start, as a share of the range between a pair's bounds."""
 CAUTION, LEAST_CAUTION = 0.995, 0.9999
 """Share of the way to the nearest bound, at first and near the solution."""
