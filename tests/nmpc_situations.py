@@ -53,10 +53,11 @@ def arc(curvature: float, speeds: Array, period: float) -> Array:
 def hard(rng: np.random.Generator, problem: NmpcProblem, decades: float = 1.0) -> Situation:
     """A vehicle that turns beside an arc, mostly so that it must reach for its limits.
 
-    Weights are drawn log-uniformly within `decades` to both sides of the defaults.
+    Weights are drawn log-uniformly within `decades` to both sides of the defaults. No input brakes
+    to below 1 m/s within the horizon, where the model's Runge-Kutta steps are no longer stable.
     """
     car, n = problem.vehicle, problem.horizon
-    vx = rng.uniform(1.0, 15.0)
+    vx = rng.uniform(1.5, 15.0)
     sharpest = min(0.12, 4.0 / vx**2)
     curvature = rng.uniform(-sharpest, sharpest)
     state = np.array(
@@ -70,7 +71,10 @@ def hard(rng: np.random.Generator, problem: NmpcProblem, decades: float = 1.0) -
         ]
     )
     low, high = problem.input_bounds
+    low[0] = max(low[0], (1.0 - vx) / (n * problem.period) + car.rolling_deceleration)
     last = np.array([rng.uniform(low[0], high[0]), car.wheelbase * curvature]).clip(low, high)
+    if vx < 5.0:
+        last[1] = rng.uniform(low[1], high[1])
     speeds = (vx + rng.normal(0.0, 1.0)) + rng.uniform(-1.5, 1.5) * problem.period * np.arange(
         n + 1
     )
