@@ -50,10 +50,13 @@ def arc(curvature: float, speeds: Array, period: float) -> Array:
     return np.column_stack([speeds, 2.0 * half, chord * np.cos(half), chord * np.sin(half)])
 
 
-def hard(rng: np.random.Generator, problem: NmpcProblem, decades: float = 1.0) -> Situation:
+def hard(
+    rng: np.random.Generator, problem: NmpcProblem, decades: float = 1.0, errors: float = 1.0
+) -> Situation:
     """A vehicle that turns beside an arc, mostly so that it must reach for its limits.
 
-    Weights are drawn log-uniformly within `decades` to both sides of the defaults. No input brakes
+    Weights are drawn log-uniformly within `decades` to both sides of the defaults; `errors` scales
+    what is wrong at the start, and with less than one the limits matter less. No input brakes
     to below 1 m/s within the horizon, where the model's Runge-Kutta steps are no longer stable.
     """
     car, n = problem.vehicle, problem.horizon
@@ -63,20 +66,24 @@ def hard(rng: np.random.Generator, problem: NmpcProblem, decades: float = 1.0) -
     state = np.array(
         [
             vx,
-            vx * curvature * car.rear_axle_distance + rng.normal(0.0, 0.1),
-            rng.normal(0.0, 0.15),
-            vx * curvature + rng.normal(0.0, 0.1),
+            vx * curvature * car.rear_axle_distance + errors * rng.normal(0.0, 0.1),
+            errors * rng.normal(0.0, 0.15),
+            vx * curvature + errors * rng.normal(0.0, 0.1),
             0.0,
-            rng.normal(0.0, 0.5),
+            errors * rng.normal(0.0, 0.5),
         ]
     )
     low, high = problem.input_bounds
     low[0] = max(low[0], (1.0 - vx) / (n * problem.period) + car.rolling_deceleration)
-    last = np.array([rng.uniform(low[0], high[0]), car.wheelbase * curvature]).clip(low, high)
-    if vx < 5.0:
+    last = np.array([errors * rng.uniform(low[0], high[0]), car.wheelbase * curvature]).clip(
+        low, high
+    )
+    if vx < 5.0 and errors >= 1.0:
         last[1] = rng.uniform(low[1], high[1])
-    speeds = (vx + rng.normal(0.0, 1.0)) + rng.uniform(-1.5, 1.5) * problem.period * np.arange(
-        n + 1
+    speeds = (
+        vx
+        + errors * rng.normal(0.0, 1.0)
+        + rng.uniform(-1.5, 1.5) * problem.period * np.arange(n + 1)
     )
     inputs, before = np.empty((n, 2)), last
     for i, step in enumerate(problem.input_steps):

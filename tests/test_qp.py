@@ -10,7 +10,7 @@ from agents.nmpc.problem import NmpcProblem, Status
 from agents.nmpc.rti_solver import RtiSolver
 from experiments.verify.derivatives import CasadiDerivatives
 from experiments.verify.qp import PiqpOracle
-from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES, VehicleParameters
+from lpv_track_env.vehicle import M2_MINIBUS, VEHICLES, VehicleParameters
 
 Array = NDArray[np.float64]
 
