@@ -283,6 +283,55 @@ def test_casadi_jacobians_agree_with_differences(car: VehicleParameters, vx: flo
     np.testing.assert_allclose(differences, exact, rtol=0, atol=largest * (1e-9 + 5.0 * kink))
 
 
+@PRESETS
+def test_jacobian_is_casadis(car: VehicleParameters) -> None:
+    """On arrays and compiled, also below 1 m/s, at standstill and in reverse."""
+    states, actions = random_inputs((-10.0, 40.0), 2_000)
+    states[0, :1000] = np.linspace(-1.2, 1.2, 1000)
+    states[0, 1000:1003] = 0.0, LOW_SPEED, -LOW_SPEED
+    x, u = ca.SX.sym("x", 6), ca.SX.sym("u", 2)
+    rate = bicycle.casadi_derivative(x, u, car)[[0, 1, 3]]
+    by_state, by_action = ca.jacobian(rate, x), ca.jacobian(rate, u)
+    wanted = ca.horzcat(by_state[:, [0, 1, 3]], by_action[:, 1])
+    function = ca.Function("j", [x, u], [ca.vec(wanted.T), by_action[:, 0], by_state[:, [2, 4, 5]]])
+    exact, by_acceleration, by_place = (
+        np.array(value) for value in function.map(2_000)(states, actions)
+    )
+    # What the docstring leaves out as plain.
+    np.testing.assert_array_equal(by_acceleration, np.outer([1.0, 0.0, 0.0], np.ones(2_000)))
+    assert not by_place.any()
+    vx, vy, _, r, _, _ = states
+    delta, parameters = actions[1], car.as_array().tolist()
+    ratio, bounded = np.minimum(np.abs(vx), LOW_SPEED), np.maximum(np.abs(vx), LOW_SPEED)
+    slope = bicycle.inverse_speed_slope_polynomial(ratio / LOW_SPEED, bounded, vx)
+    plain = bicycle.jacobian(
+        vx, vy, r, delta, np.cos(delta), np.sin(delta), bicycle.inverse_speed(vx), slope,
+        *parameters,
+    )  # fmt: skip
+    compiled = np.empty((12, 2_000))
+    for k in range(2_000):
+        one, angle = float(vx[k]), float(delta[k])
+        compiled[:, k] = bicycle.compiled_jacobian(
+            one, float(vy[k]), float(r[k]), angle, math.cos(angle), math.sin(angle),
+            compiled_inverse_speed(one), bicycle.compiled_inverse_speed_slope(one), *parameters,
+        )  # fmt: skip
+    sizes = np.maximum(np.abs(exact), np.abs(exact).max(axis=1, keepdims=True) * 1e-3)
+    assert_close(np.array(plain), exact, sizes)
+    assert_close(compiled, exact, sizes)
+
+
+def test_slope_of_the_inverse_speed_is_casadis() -> None:
+    vx = np.concatenate([np.linspace(-3.0, 3.0, 401), [-40.0, -1e-12, 1e-12, 40.0]])
+    symbol = ca.SX.sym("vx")
+    value = bicycle.casadi_inverse_speed(symbol)
+    function = ca.Function("slope", [symbol], [ca.jacobian(value, symbol)]).map(len(vx))
+    compiled = [bicycle.compiled_inverse_speed_slope(one) for one in vx.tolist()]
+    np.testing.assert_allclose(compiled, np.array(function(vx)).ravel(), rtol=1e-12, atol=1e-15)
+    for one in (-7.0, -1.0, 1.0, 7.0):  # where q = 1/|vx|
+        slope = bicycle.compiled_inverse_speed_slope(one)
+        assert slope == pytest.approx(-math.copysign(1.0, one) / one**2, rel=1e-15)
+
+
 # Independent physics -------------------------------------------------------------------------
 
 
