@@ -26,7 +26,7 @@ STEP_TOLERANCE = 1e-11
 """Largest change of an input at which the plan has converged."""
 SHORTEST = 1e-6
 """Least length of a step."""
-DEPTH = 5
+DEPTH = 10
 """Steps that Anderson's method mixes."""
 PATIENCE = 8
 """Steps in a row that may save nothing beyond rounding."""
