@@ -1,6 +1,8 @@
 """The contract of everything that drives, over every registered name."""
 
+import copy
 import functools
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -185,6 +187,19 @@ def test_a_batch_acts_as_single_agents(name: str) -> None:
 
 
 @each_agent
+def test_copies_go_on_alike(name: str) -> None:
+    start = in_the_bend(name)
+    rows, agent = u_turn(name).rows[start : start + 10], made(name)
+    for row in rows[:5]:
+        agent.predict(row)
+    clones = [copy.deepcopy(agent), pickle.loads(pickle.dumps(agent))]  # noqa: S301
+    for row in rows[5:]:
+        action, _ = agent.predict(row)
+        for clone in clones:
+            np.testing.assert_array_equal(clone.predict(row)[0], action)
+
+
+@each_agent
 @pytest.mark.parametrize("change", [-1, 2])
 def test_an_observation_of_another_size_is_refused(name: str, change: int) -> None:
     agent = made(name)
@@ -295,7 +310,7 @@ def test_stanley_loads_neither_casadi_nor_torch() -> None:
     assert done.stdout.strip() == "[]", done.stderr
 
 
-@pytest.mark.parametrize("name", ["stanley", "lpv-nmpc-ipopt"])
+@pytest.mark.parametrize("name", ["stanley", "lpv-nmpc", "lpv-nmpc-ipopt"])
 def test_agents_pass_through_sb3s_evaluate_policy(name: str) -> None:
     """Two environments at once, four episodes; perfect tracking returns 1 a second."""
     from stable_baselines3.common.env_util import make_vec_env

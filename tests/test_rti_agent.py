@@ -1,0 +1,335 @@
+"""The real-time NMPC as an agent of batches: memories, weights, and observations of every kind."""
+
+from collections import Counter
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from nmpc_situations import WEIGHTS
+from numpy.typing import NDArray
+
+import agents
+import lpv_track_env  # noqa: F401  registers the environments
+from agents.nmpc import rti
+from agents.nmpc.problem import Status
+from agents.weights import TrackingWeights, WeightSchedule
+from lpv_track_env.observation import SCALARS
+from lpv_track_env.registration import PATH_TRACKING
+from lpv_track_env.vector_env import PathTrackingVectorEnv
+from lpv_track_env.vehicle import VEHICLES
+from trajectories import CurvatureBands
+
+Array = NDArray[Any]
+BEGIN, GOES_ON = np.array([True]), np.array([False])
+MAX_ITERATIONS = 40
+"""Of the interior-point method, after the tries of the active-set method that count as well."""
+
+
+def environment(**settings: Any) -> gymnasium.Env:
+    return gymnasium.make(PATH_TRACKING, **{"trajectory": "u-turn", **settings})
+
+
+def made(env: gymnasium.Env | None = None, **settings: Any) -> Any:
+    return agents.make("lpv-nmpc", environment() if env is None else env, **settings)
+
+
+def drives(n: int, steps: int) -> Array:
+    """Observations (steps, n, size) of vehicles that are driven from all over a path."""
+    envs = PathTrackingVectorEnv(
+        n, "T1", random_start=True, initial_error_range=(0.5, 0.1, 1.0), autoreset_mode="Disabled"
+    )
+    agent = agents.make("lpv-nmpc", envs.single)
+    seen = [envs.reset(seed=3)[0]]
+    for _ in range(steps - 1):
+        seen.append(envs.step(agent.predict(seen[-1])[0])[0])
+    return np.array(seen)
+
+
+# Batches and memories ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [1, 3, 17])
+def test_batch_is_single_vehicles_bit_for_bit(n: int) -> None:
+    rows, together = drives(n, 8), made()
+    batches = [together.predict(row)[0] for row in rows]
+    alone = made()
+    for k in range(n):
+        alone.reset()
+        for step, row in enumerate(rows):
+            action, _ = alone.predict(row[k])
+            assert action.shape == (2,)
+            assert action.dtype == np.float32
+            np.testing.assert_array_equal(batches[step][k], action)
+
+
+@pytest.mark.parametrize("n", [1, 3, 17])
+def test_episode_start_clears_the_marked_rows_alone(n: int) -> None:
+    # From the time on at which the steering no longer runs along its limits.
+    rows, agent, untouched, fresh = drives(n, 38)[30:], made(), made(), made()
+    marked = np.arange(n) % 3 == 0
+    for row in rows[:5]:
+        agent.predict(row, None, np.zeros(n, dtype=bool))
+        untouched.predict(row)
+    for k, row in enumerate(rows[5:]):
+        actions, _ = agent.predict(row, None, marked if k == 0 else np.zeros(n, dtype=bool))
+        going_on, beginning = untouched.predict(row)[0], fresh.predict(row)[0]
+        np.testing.assert_array_equal(actions[~marked], going_on[~marked])
+        np.testing.assert_array_equal(actions[marked], beginning[marked])
+        # In the row that begins its warm start is gone, so the actions do differ.
+        if k == 0:
+            assert (going_on[marked] != beginning[marked]).any()
+
+
+def test_failures_of_one_row_are_not_anothers() -> None:
+    rows, agent, healthy = drives(3, 8), made(max_failures=2), made(max_failures=2)
+    told = []
+    for k, row in enumerate(rows):
+        lost = row.copy()
+        if k >= 2:
+            lost[1, 5] = np.nan
+        if k >= 4:
+            lost[2, 0] = np.inf
+        actions, memory = agent.predict(lost, None, np.array([False, False, k == 7]))
+        np.testing.assert_array_equal(actions[0], healthy.predict(row)[0][0])
+        told.append([agent.diagnostics(memory[i])["fallback"] for i in range(3)])
+    # Row 2 begins anew in the last step: no plan any more, one failure.
+    assert [row[1] for row in told] == ["", "", "plan", "plan", "stop", "stop", "stop", "stop"]
+    assert [row[2] for row in told] == ["", "", "", "", "plan", "plan", "stop", "stanley"]
+    assert not any(row[0] for row in told)
+
+
+def test_memories_are_handed_in_and_out() -> None:
+    rows, agent, other = drives(3, 6), made(), made()
+    # Two drives with one agent: what is handed in is written, its own memory is left alone.
+    _, mine = agent.predict(rows[0], None, BEGIN)
+    _, handed = other.predict(rows[1][::-1])
+    wanted, twin = [made(), made()], []
+    wanted[0].predict(rows[0])
+    wanted[1].predict(rows[1][::-1])
+    for row in rows[2:]:
+        first, back = agent.predict(row)
+        second, handed = agent.predict(row[::-1], handed)
+        assert back is mine
+        np.testing.assert_array_equal(first, wanted[0].predict(row)[0])
+        np.testing.assert_array_equal(second, wanted[1].predict(row[::-1])[0])
+        twin.append(handed)
+    assert all(memory is twin[0] for memory in twin)
+    assert len(handed) == 3
+    # Of another size: it begins anew, as every agent does.
+    actions, new = agent.predict(rows[3][:2], handed)
+    np.testing.assert_array_equal(actions, made().predict(rows[3][:2])[0])
+    assert len(new) == 2
+
+
+def test_actions_and_diagnostics_handed_out_are_copies() -> None:
+    rows, agent, untouched = drives(3, 5), made(), made()
+    for row in rows:
+        actions, memory = agent.predict(row)
+        np.testing.assert_array_equal(actions, untouched.predict(row)[0])
+        told = agent.diagnostics(memory[1])
+        for value in (actions, told["plan"], told["slack"]):
+            value[:] = 7.0
+
+
+def test_diagnostics_of_a_row() -> None:
+    rows, agent = drives(3, 2), made()
+    for row in rows:
+        _, memory = agent.predict(row)
+    single = made()
+    for k in range(3):
+        single.reset()
+        for row in rows:
+            _, alone = single.predict(row[k])
+        wanted, told = single.diagnostics(alone[0]), agent.diagnostics(memory[k])
+        assert told.keys() == wanted.keys()
+        assert told["status"] == "SUCCESS"
+        assert told["plan"].shape == (21, 2)
+        # The plan begins where the vehicle is, in the frame of the path's foot point.
+        np.testing.assert_allclose(told["plan"][0], [0.0, rows[-1][k][5]])
+        assert told["slack"].shape == (3,)
+        for name in ("status", "iterations", "cost", "fallback"):
+            assert told[name] == wanted[name]
+    np.testing.assert_array_equal(agent.diagnostics(memory[-1])["plan"], told["plan"])
+    with pytest.raises(IndexError, match="row 3 of 3"):
+        memory[3]
+
+
+@pytest.mark.parametrize("shape", [(47,), (49,), (3, 47), (0, 47), (2, 3, 48), (48, 1), ()])
+def test_observations_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    agent = made()
+    with pytest.raises(ValueError, match="this layout has 48 entries"):
+        agent.predict(np.zeros(shape, dtype=np.float32))
+
+
+def test_any_array_of_an_observation_does() -> None:
+    """Other memory layouts and types act alike, and none has the solver compiled for it anew."""
+    rows, agent = drives(3, 1)[0], made()
+    wanted = agent.predict(rows)[0]
+    known = len(rti.control.signatures)  # type: ignore[attr-defined]
+    doubles = rows.astype(np.float64)
+    fixed = doubles.copy()
+    fixed.flags.writeable = False
+    kinds = {
+        "strided": np.repeat(rows, 2, axis=0)[::2], "Fortran's order": np.asfortranarray(rows),
+        "double": doubles, "doubles, strided": np.repeat(doubles, 2, axis=1)[:, ::2],
+        "read-only doubles": fixed, "list": rows.tolist(),
+    }  # fmt: skip
+    for name, same in kinds.items():
+        actions, _ = agent.predict(same, None, np.ones(3, dtype=bool))
+        np.testing.assert_array_equal(actions, wanted, err_msg=name)
+        assert len(rti.control.signatures) == known, f"compiled anew for: {name}"  # type: ignore[attr-defined]
+
+
+# Settings ------------------------------------------------------------------------------------
+
+
+def test_new_weights_hold_from_the_next_step_and_keep_the_warm_start() -> None:
+    rows, agent, heavy = drives(3, 4), made(), TrackingWeights(Q=(1.0, 1.0, 100.0, 100.0))
+    born, old = made(weights=heavy), made()
+    _, memory = agent.predict(rows[0])
+    _, state = old.predict(rows[0])
+    assert agent.set_weights(heavy)
+    assert not np.array_equal(agent.predict(rows[1])[0], old.predict(rows[1])[0])
+    # An agent made with these weights that goes on from the same memory does the same.
+    _, state = old.predict(rows[0], None, BEGIN)
+    actions, _ = agent.predict(rows[1], agent.predict(rows[0], None, BEGIN)[1])
+    assert len(state) == len(memory) == 3
+    old.set_weights(heavy)
+    _, state = old.predict(rows[0], None, BEGIN)
+    np.testing.assert_array_equal(born.predict(rows[1], state)[0], actions)
+
+
+def test_schedule_by_band_chooses_for_every_row() -> None:
+    """Each row is what an agent with that band's weights does."""
+    sets = tuple(TrackingWeights(R=(0.01, scale)) for scale in (1.0, 3.0, 9.0, 27.0))
+    schedule = WeightSchedule(CurvatureBands(), sets)
+    rows, agent = drives(17, 1)[0], made(weights=schedule)
+    actions, memory = agent.predict(rows)
+    assert len(set(memory.bands)) > 1
+    for row, action, band in zip(rows, actions, memory.bands, strict=True):
+        np.testing.assert_array_equal(made(weights=sets[band]).predict(row)[0], action)
+    broken = rows.copy()
+    broken[0, len(SCALARS)] = np.nan
+    assert np.isfinite(agent.predict(broken)[0]).all()
+
+
+def test_control_period_shorter_than_the_previews() -> None:
+    """It plans on periods of 0.1 s, acts every 0.05 s, and moves its plan on by halves."""
+    env = environment(control_period=0.05, preview_period=0.1, preview_steps=15)
+    agent = made(env)
+    assert agent.problem.period == 0.1
+    np.testing.assert_allclose(
+        agent.problem.input_steps[:2, 0], agent.problem.vehicle.max_jerk * np.array([0.05, 0.1])
+    )
+    observation, info = env.reset(seed=0)
+    lateral, clipped, done = [], 0, False
+    while not done:
+        action, memory = agent.predict(observation)
+        assert agent.diagnostics(memory[0])["status"] == "SUCCESS"
+        observation, _, terminated, truncated, info = env.step(action)
+        lateral.append(abs(info["lateral_error"]))
+        clipped += bool(info["clipped"])
+        done = terminated or truncated
+    assert info["end"] == "finished"
+    assert max(lateral) < 0.05
+    assert clipped == 0
+    # Blind, it follows its last plan: each of its periods lasts two steps.
+    env.reset(options={"arc_length": 40.0})
+    observation, _ = env.reset(options={"arc_length": 40.0, "lateral_error": 0.3})
+    _, memory = agent.predict(observation, None, BEGIN)
+    plan, lost = memory.plans[0].copy(), observation.copy()
+    lost[5] = np.nan
+    followed = [agent.predict(lost)[0] for _ in range(4)]
+    np.testing.assert_allclose(followed, plan[[0, 1, 1, 2]], rtol=1e-6)
+
+
+def test_horizon_shorter_than_the_preview() -> None:
+    rows, agent = drives(3, 1)[0], made(horizon=7)
+    _, memory = agent.predict(rows)
+    assert agent.diagnostics(memory[0])["plan"].shape == (8, 2)
+    # What lies beyond the horizon is not looked at.
+    changed = rows.copy()
+    changed[:, len(SCALARS) + 7 : len(SCALARS) + 20] = 0.1
+    np.testing.assert_array_equal(
+        made(horizon=7).predict(changed)[0], made(horizon=7).predict(rows)[0]
+    )
+
+
+# Robustness ----------------------------------------------------------------------------------
+
+
+def wild_observations(rng: np.random.Generator, count: int, steps: int) -> Array:
+    """Speeds to 30 m/s, errors to 5 m and 1 rad, actuators and curvature beyond all bounds."""
+    rows = np.empty((count, 8 + 2 * steps))
+    scalars = [(0.0, 30.0), (-3.0, 3.0), (-1.5, 1.5), (-9.0, 6.0), (-0.8, 0.8), (-5.0, 5.0),
+               (-1.0, 1.0), (0.0, 30.0)]  # fmt: skip
+    for k, bounds in enumerate(scalars):
+        rows[:, k] = rng.uniform(*bounds, count)
+    # Half of the paths bend steadily, half jump about; a tenth are beyond any path.
+    curvature = rng.uniform(-0.5, 0.5, (count, 1)) * np.ones(steps)
+    jumping = rng.random(count) < 0.5
+    curvature[jumping] = rng.uniform(-0.5, 0.5, (int(jumping.sum()), steps))
+    curvature[rng.random(count) < 0.1] *= 10.0
+    rows[:, 8 : 8 + steps] = curvature
+    ramp = rng.uniform(-3.0, 3.0, (count, 1)) * 0.05 * np.arange(1, steps + 1)
+    rows[:, 8 + steps :] = np.clip(rows[:, 7:8] + ramp, 0.0, 30.0)
+    broken = np.flatnonzero(rng.random(count) < 0.05)
+    rows[broken, rng.integers(0, rows.shape[1], len(broken))] = rng.choice(
+        [np.nan, np.inf, -np.inf], len(broken)
+    )
+    return rows.astype(np.float32)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_wild_observations(vehicle: str) -> None:
+    """24,000 in all. What cannot be solved says so, and every action can be driven."""
+    env = environment(vehicle=vehicle)
+    agent, rng, n = made(env), np.random.default_rng(5), 3000
+    statuses: Counter[str] = Counter()
+    for _ in range(2):
+        rows = wild_observations(rng, n, agent.task.layout.preview_steps)
+        # Twice: without plans, and with plans that were made for something else.
+        for cold in (True, False):
+            rows = rows if cold else rows[rng.permutation(n)]
+            actions, memory = agent.predict(rows, None, np.full(n, cold))
+            assert np.isfinite(actions).all()
+            assert (actions >= env.action_space.low).all()  # type: ignore[attr-defined]
+            assert (actions <= env.action_space.high).all()  # type: ignore[attr-defined]
+            finite = np.isfinite(rows).all(axis=1)
+            for k in range(n):
+                told = agent.diagnostics(memory[k])
+                status = Status(told["status"])
+                assert (status is Status.NAN) == (not finite[k])
+                assert 0 <= told["iterations"] <= MAX_ITERATIONS
+                assert (told["fallback"] == "") == (status is Status.SUCCESS)
+                statuses[status.value] += 1
+    solvable = statuses.total() - statuses["NAN"]
+    assert statuses["NAN"] > 0.03 * statuses.total()
+    assert statuses["SUCCESS"] > 0.95 * solvable, statuses
+
+
+def test_nothing_of_a_wild_batch_stays_in_the_solver() -> None:
+    """The workspace is shared by all rows: what one left there must not touch the next."""
+    rng, rows = np.random.default_rng(6), drives(3, 1)[0]
+    agent = made()
+    wanted = agent.predict(rows)[0]
+    agent.predict(wild_observations(rng, 300, 20))
+    np.testing.assert_array_equal(agent.predict(rows, None, np.ones(3, dtype=bool))[0], wanted)
+    mixed = np.insert(wild_observations(rng, 3, 20), [0, 1, 2], rows, axis=0)
+    np.testing.assert_array_equal(agent.predict(mixed)[0][::2], wanted)
+
+
+def test_actions_on_the_way_to_bounds_lie_in_the_action_space() -> None:
+    """The bounds are float32's: rounding to it must not step over them."""
+    env = environment()
+    agent = made(env, weights=TrackingWeights.from_array(WEIGHTS * ([100.0] * 8 + [1e-3, 1e-3])))
+    observation, _ = env.reset(options={"lateral_error": 3.0})
+    rows = np.repeat(observation[None], 200, axis=0)
+    rng = np.random.default_rng(7)
+    rows[:, 3] = rng.choice([3.5, 3.4999998, 3.2, -6.0], 200)
+    rows[:, 4] = rng.choice([-np.pi / 6, np.pi / 6, -0.51], 200)
+    actions, _ = agent.predict(rows)
+    for action in actions:
+        assert env.action_space.contains(action)
+    assert np.isclose(np.abs(actions[:, 1]), np.pi / 6).any()
