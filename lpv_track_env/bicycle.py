@@ -68,27 +68,27 @@ def field(
     rolling_deceleration: Any,
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
     """Time derivative of [vx, vy, psi, r, X, Y]; `q` is the inverse speed, see the module."""
-    # Slips are axle velocities, slip angle times |vx|, and forces are linear in vx, vy and r; q turns
-    # them into those of angles at the very end. So a stage of an integrator waits for one division
-    # and few operations beside it, and what stays within a control period (the stiffnesses with the
-    # mass, the inertia and the steering angle) stands in brackets in front of vx, vy and r.
+    # Slips are axle velocities, slip angle times |vx|; q makes them angles at the very end, and
+    # forces are written out as linear forms of vx, vy, r. So a stage of an integrator waits for
+    # one division and few operations beside it, and what stays within a control period (stiffnesses
+    # with mass, inertia and steering angle) stands in front of vx, vy and r.
     inverse_mass, inverse_inertia = 1.0 / mass, 1.0 / yaw_inertia
     front, rear = caf * cos_delta, car
     drag = caf * sin_delta * inverse_mass
     across, rear_across = front * inverse_mass, rear * inverse_mass
     turning, rear_turning = front * lf * inverse_inertia, rear * lr * inverse_inertia
+    backward = (rolling_deceleration + drag * delta) * vx - (drag * vy + (drag * lf) * r)
+    sideward = (across * delta) * vx - (
+        (across + rear_across) * vy + (across * lf - rear_across * lr) * r
+    )
+    turnward = (turning * delta) * vx - (
+        (turning - rear_turning) * vy + (turning * lf + rear_turning * lr) * r
+    )
     return (
-        (a + r * vy)
-        - ((rolling_deceleration + drag * delta) * vx - (drag * vy + (drag * lf) * r)) * q,
-        ((across * delta) * vx - ((across + rear_across) * vy + (across * lf - rear_across * lr) * r))
-        * q
-        - r * vx,
+        (a + r * vy) - backward * q,
+        sideward * q - r * vx,
         r,
-        (
-            (turning * delta) * vx
-            - ((turning - rear_turning) * vy + (turning * lf + rear_turning * lr) * r)
-        )
-        * q,
+        turnward * q,
         vx * cos_psi - vy * sin_psi,
         vx * sin_psi + vy * cos_psi,
     )
