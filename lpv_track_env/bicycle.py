@@ -68,21 +68,27 @@ def field(
     rolling_deceleration: Any,
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
     """Time derivative of [vx, vy, psi, r, X, Y]; `q` is the inverse speed, see the module."""
-    # Slips are axle velocities, slip angle times |vx|; q turns them into angles at the very end. So
-    # a stage of an integrator waits for one division, and what stays within a control period (the
-    # stiffnesses with the mass, the inertia and the steering angle) stands in front of each term.
-    slip_front = delta * vx - (vy + lf * r)
-    slip_rear = lr * r - vy
+    # Slips are axle velocities, slip angle times |vx|; q makes them angles at the very end, and
+    # forces are written out as linear forms of vx, vy, r. So a stage of an integrator waits for
+    # one division and few operations beside it, and what stays within a control period (stiffnesses
+    # with mass, inertia and steering angle) stands in front of vx, vy and r.
     inverse_mass, inverse_inertia = 1.0 / mass, 1.0 / yaw_inertia
     front, rear = caf * cos_delta, car
+    drag = caf * sin_delta * inverse_mass
+    across, rear_across = front * inverse_mass, rear * inverse_mass
+    turning, rear_turning = front * lf * inverse_inertia, rear * lr * inverse_inertia
+    backward = (rolling_deceleration + drag * delta) * vx - (drag * vy + (drag * lf) * r)
+    sideward = (across * delta) * vx - (
+        (across + rear_across) * vy + (across * lf - rear_across * lr) * r
+    )
+    turnward = (turning * delta) * vx - (
+        (turning - rear_turning) * vy + (turning * lf + rear_turning * lr) * r
+    )
     return (
-        a
-        - (rolling_deceleration * vx + (caf * sin_delta * inverse_mass) * slip_front) * q
-        + r * vy,
-        ((front * inverse_mass) * slip_front + (rear * inverse_mass) * slip_rear) * q - r * vx,
+        (a + r * vy) - backward * q,
+        sideward * q - r * vx,
         r,
-        ((front * lf * inverse_inertia) * slip_front - (rear * lr * inverse_inertia) * slip_rear)
-        * q,
+        turnward * q,
         vx * cos_psi - vy * sin_psi,
         vx * sin_psi + vy * cos_psi,
     )

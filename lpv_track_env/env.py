@@ -1,6 +1,6 @@
 """`lpv_track_env/PathTracking-v0`: drive a reference path with acceleration and steering."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import isfinite
 from pathlib import Path
@@ -14,16 +14,25 @@ from numpy.typing import NDArray
 from lpv_track_env import episodes, kernels, vehicle
 from lpv_track_env.episodes import given_start, random_key
 from lpv_track_env.observation import ObservationLayout
-from lpv_track_env.reward import RewardWeights
+from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.task import CONDITIONS, Task, action_space, checked_period, choose, reference
+from lpv_track_env.vector_infos import single_info
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
+from trajectories.compilation import entry_point
 
 if TYPE_CHECKING:
     from lpv_track_env.rendering import Renderer
 
 RESET_OPTIONS = ("trajectory", "vehicle", *episodes.GIVEN)
 NUMBERS = (float, int)
+INFO: dict[str, Any] = dict.fromkeys(
+    (
+        "lateral_error", "heading_error", "speed_error", "arc_length", "state", "reward_terms",
+        "clipped",
+    )
+)  # fmt: skip
+REWARD_TERMS = dict.fromkeys(TERMS, 0.0)
 
 
 class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -157,12 +166,10 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         )
         fps = max(round(1.0 / self.base_task.control_period), 1)
         self.metadata = {**self.metadata, "render_fps": fps}
-        self._bound = self.base_task.layout.bound
-        self.observation_space = spaces.Box(-self._bound, self._bound, dtype=np.float32)
+        bound = self.base_task.layout.bound
+        self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
         self.action_space = action_space([car])
-        self._observation = np.zeros(self.base_task.layout.size, dtype=np.float32)
-        self._memory = np.zeros(kernels.MEMORY_SIZE)
-        self._action = np.zeros(2)
+        self._episode_data = np.zeros(kernels.OBSERVATION + self.base_task.layout.size // 2)
         self._running = False
         self._key, self._episode = np.uint64(0), -1
         self._renderer: Renderer | None = None
@@ -170,22 +177,31 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._use(self.base_task)
 
     def _open_views(self) -> None:
-        """Parts of the arrays that every step needs: to make a view costs as much as a copy."""
+        """Parts of the episode's array: to make a view costs as much as a copy."""
+        data = self._episode_data
+        self._memory = data[kernels.MEMORY : kernels.CONSTANTS]
         self._state = self._memory[:6]
-        self._judged = self._memory[kernels.ARC_LENGTH :]
+        self._constants = data[kernels.CONSTANTS : kernels.OBSERVATION]
+        self._observation = data[kernels.OBSERVATION :].view(np.float32)
         # Python numbers pass through a memoryview in half the time.
-        self._command: Any = self._action.data
+        self._command: Any = data.data
 
     def _use(self, task: Task) -> None:
         if getattr(self, "task", None) is task:
             return
         self.task = task
-        self._constants = task.constants()
-        self._table = task.path.table
-        self._arguments = (
-            self._memory, self._action, self._constants, self._table, self._bound,
-            self._observation,
-        )  # fmt: skip
+        self._constants[:] = task.constants()
+        self._take_table(task.path.table)
+
+    def _take_table(self, table: NDArray[np.float64]) -> None:
+        self._table = table
+        self._arguments = (self._episode_data, table)
+        self._advance: Callable[..., Any] = self._first_advance
+
+    def _first_advance(self, *arguments: NDArray[np.float64]) -> Any:
+        """Have `kernels.advance` compiled where it is needed, in a first step, and go there."""
+        self._advance = entry_point(kernels.advance, *arguments)
+        return self._advance(*arguments)
 
     @property
     def path(self) -> ReferencePath:
@@ -226,7 +242,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._count_episode(reseeded=seed is not None)
         self._use(task)
         episodes.begin(
-            self._memory, self._constants, self._table, self._bound, self._observation,
+            self._memory, self._constants, self._table, self._observation,
             self._key, self._episode, given,
         )  # fmt: skip
         self._running = True
@@ -234,7 +250,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer.begin(task)
         if self.render_mode == "human":
             self.render()
-        return self._observation.copy(), self._outcome()[1]
+        return self._observation.copy(), single_info(self._memory)
 
     def _count_episode(self, *, reseeded: bool) -> None:
         """Take a new key from `np_random` if it was seeded, else go on to the next episode."""
@@ -271,56 +287,46 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             a, delta = _two_numbers(action)
         if type(a) is not float or type(delta) is not float:
             a, delta = _two_numbers(action)
-        if not (isfinite(a) and isfinite(delta)):
-            entry = "1 (steering angle)" if isfinite(a) else "0 (acceleration)"
-            raise ValueError(f"action entry {entry} is not finite: {action!r}")
         command = self._command
         command[0] = a
         command[1] = delta
-        end = kernels.step(*self._arguments)
-        reward, info = self._outcome()
+        # To copy a dictionary and to fill it takes less time than to write a new one.
+        info = INFO.copy()
+        info["reward_terms"] = terms = REWARD_TERMS.copy()
+        (
+            end, info["arc_length"], info["lateral_error"], info["heading_error"],
+            info["speed_error"], info["clipped"], reward, terms["progress"], terms["lateral"],
+            terms["heading"], terms["speed"], terms["input_rate"], terms["end"],
+        ) = self._advance(*self._arguments)  # fmt: skip
+        info["state"] = self._state.copy()
         terminated = truncated = False
         if end:
+            if end == kernels.NOT_FINITE:
+                entry = "1 (steering angle)" if isfinite(a) else "0 (acceleration)"
+                raise ValueError(f"action entry {entry} is not finite: {action!r}")
             info["end"] = kernels.END_NAMES[end]
             truncated = end == kernels.TIME_LIMIT
             terminated = not truncated
             self._running = False
+        if self.render_mode is not None:
+            self._show()
+        return self._observation.copy(), reward, terminated, truncated, info
+
+    def _show(self) -> None:
         if self._renderer is not None:
             self._renderer.follow(self._memory)
         if self.render_mode == "human":
             self.render()
-        return self._observation.copy(), reward, terminated, truncated, info
-
-    def _outcome(self) -> tuple[float, dict[str, Any]]:
-        """Reward of the last step and the info of the present situation."""
-        # In the order of the indices in `kernels`, taken apart at once: to look them up one by one
-        # takes several times as long.
-        (
-            arc_length, _, _, lateral_error, heading_error, speed_error, _, clipped, _, reward,
-            progress, lateral, heading, speed, input_rate, end,
-        ) = self._judged.tolist()  # fmt: skip
-        return reward, {
-            "lateral_error": lateral_error,
-            "heading_error": heading_error,
-            "speed_error": speed_error,
-            "arc_length": arc_length,
-            "state": self._state.copy(),
-            "reward_terms": {
-                "progress": progress,
-                "lateral": lateral,
-                "heading": heading,
-                "speed": speed,
-                "input_rate": input_rate,
-                "end": end,
-            },
-            "clipped": int(clipped) if clipped else 0,
-        }
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene: a frame (600, 900, 3) uint8 for "rgb_array", a window for "human"."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() needs render_mode='human' or 'rgb_array'")
             return None
+        if self._episode < 0:
+            raise gymnasium.error.ResetNeeded(
+                "the episode has not begun: call reset() before render()"
+            )
         return self._open_renderer(self.render_mode).draw(self._memory)
 
     def _open_renderer(self, render_mode: str) -> "Renderer":
@@ -351,14 +357,18 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer = None
 
     def __getstate__(self) -> dict[str, Any]:
-        # Copied on their own, the views would no longer look at the arrays.
-        views = {"_state", "_judged", "_command"}
-        kept = {name: value for name, value in self.__dict__.items() if name not in views}
+        # Copied on their own, the views would no longer look at the array.
+        views = {"_memory", "_state", "_constants", "_observation", "_command"}
+        compiled = {"_arguments", "_advance"}
+        kept = {
+            name: value for name, value in self.__dict__.items() if name not in views | compiled
+        }
         return {**kept, "_renderer": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._open_views()
+        self._take_table(self._table)
 
 
 def _two_numbers(action: Any) -> tuple[float, float]:

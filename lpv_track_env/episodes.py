@@ -93,7 +93,7 @@ def error(given: Any, half: Any, key: Any, episode: Any, draw: int) -> Any:
 
 @compiled
 def begin(
-    memory: Array, constants: Array, table: Array, bound: Array, observation: Array,
+    memory: Array, constants: Array, table: Array, observation: Array,
     key: Any, episode: Any, given: Array,
 ) -> None:  # fmt: skip
     """Begin an episode: draw what is not given, set the state, write memory and observation.
@@ -117,4 +117,4 @@ def begin(
     memory[Y] = y + lateral_error * math.cos(heading)
     memory[kernels.ACCELERATION] = p[ROLLING_DECELERATION]
     memory[kernels.ARC_LENGTH] = s
-    kernels.start(memory, p, table, bound, observation)
+    kernels.start(memory, p, table, observation)

@@ -17,11 +17,19 @@ from trajectories.compilation import compiled, compiled_inline
 
 
 @compiled_inline
-def rotate(c: Any, s: Any, angle: Any) -> tuple[Any, Any]:
-    """(cos, sin) turned by a small angle: Taylor series to order 7, no call of libm."""
+def turned(angle: Any) -> tuple[Any, Any]:
+    """(cos, sin) of a small angle: Taylor series to order 7, no call of libm."""
     q = angle * angle
-    dc = 1.0 - q * (0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0)))
-    ds = angle * (1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q * (1.0 / 5040.0))))
+    return (
+        1.0 - q * (0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0))),
+        angle * (1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q * (1.0 / 5040.0)))),
+    )
+
+
+@compiled_inline
+def rotate(c: Any, s: Any, angle: Any) -> tuple[Any, Any]:
+    """(cos, sin) of a heading turned by a small angle."""
+    dc, ds = turned(angle)
     return c * dc - s * ds, s * dc + c * ds
 
 
@@ -38,40 +46,58 @@ def runge_kutta(
 ) -> tuple[Any, Any, Any, Any, Any, Any]:  # fmt: skip
     """One Runge-Kutta step (classic, order 4) of h seconds, inputs held.
 
-    (c, s) and (cd, sd) are cosine and sine of heading and steering angle; p1 to p6 the vehicle's
-    parameters from the yaw inertia on, per unit of mass (see `per_mass`). Returns the new vx, vy
-    and r, and the changes of psi, X and Y.
+    (c, s) and (cd, sd) are cosine and sine of heading and steering angle. The yaw rate r, the
+    acceleration a and the parameters p1 to p6 (from the yaw inertia on) are in units of half a
+    step, see `in_half_steps`. Returns the new vx, vy and r, and the changes of psi (rad), X and Y
+    (m).
+
+    What the next stage waits for is few operations long: half a step's change is the derivative
+    itself, and positions, which nothing waits for, are summed in the frame of the step's start.
     """
-    half = 0.5 * h
     q = inverse_speed(vx, lanes)
-    k1 = compiled_field(vx, vy, r, c, s, a, delta, cd, sd, q, 1.0, p1, p2, p3, p4, p5, p6)
-    ux, uy, w = vx + half * k1[0], vy + half * k1[1], r + half * k1[3]
-    c2, s2 = rotate(c, s, half * k1[2])
+    k1 = compiled_field(vx, vy, r, 1.0, 0.0, a, delta, cd, sd, q, 1.0, p1, p2, p3, p4, p5, p6)
+    ux, uy, w = vx + k1[0], vy + k1[1], r + k1[3]
+    c2, s2 = turned(k1[2])
     q = inverse_speed(ux, lanes)
     k2 = compiled_field(ux, uy, w, c2, s2, a, delta, cd, sd, q, 1.0, p1, p2, p3, p4, p5, p6)
-    ux, uy, w = vx + half * k2[0], vy + half * k2[1], r + half * k2[3]
-    c2, s2 = rotate(c, s, half * k2[2])
+    ux, uy, w = vx + k2[0], vy + k2[1], r + k2[3]
+    c3, s3 = turned(k2[2])
     q = inverse_speed(ux, lanes)
-    k3 = compiled_field(ux, uy, w, c2, s2, a, delta, cd, sd, q, 1.0, p1, p2, p3, p4, p5, p6)
-    ux, uy, w = vx + h * k3[0], vy + h * k3[1], r + h * k3[3]
-    c2, s2 = rotate(c, s, h * k3[2])
+    k3 = compiled_field(ux, uy, w, c3, s3, a, delta, cd, sd, q, 1.0, p1, p2, p3, p4, p5, p6)
+    ux, uy, w = vx + 2.0 * k3[0], vy + 2.0 * k3[1], r + 2.0 * k3[3]
+    c4, s4 = turned(2.0 * k3[2])
     q = inverse_speed(ux, lanes)
-    k4 = compiled_field(ux, uy, w, c2, s2, a, delta, cd, sd, q, 1.0, p1, p2, p3, p4, p5, p6)
-    sixth = h * (1.0 / 6.0)
+    k4 = compiled_field(ux, uy, w, c4, s4, a, delta, cd, sd, q, 1.0, p1, p2, p3, p4, p5, p6)
+    third, sixth = 1.0 / 3.0, h * (1.0 / 6.0)
+    ahead = sixth * (k1[4] + 2.0 * (k2[4] + k3[4]) + k4[4])
+    aside = sixth * (k1[5] + 2.0 * (k2[5] + k3[5]) + k4[5])
     return (
-        vx + sixth * (k1[0] + 2.0 * (k2[0] + k3[0]) + k4[0]),
-        vy + sixth * (k1[1] + 2.0 * (k2[1] + k3[1]) + k4[1]),
-        r + sixth * (k1[3] + 2.0 * (k2[3] + k3[3]) + k4[3]),
-        sixth * (k1[2] + 2.0 * (k2[2] + k3[2]) + k4[2]),
-        sixth * (k1[4] + 2.0 * (k2[4] + k3[4]) + k4[4]),
-        sixth * (k1[5] + 2.0 * (k2[5] + k3[5]) + k4[5]),
+        # The last stage, which comes latest, is added at the very end.
+        (vx + third * (k1[0] + 2.0 * (k2[0] + k3[0]))) + third * k4[0],
+        (vy + third * (k1[1] + 2.0 * (k2[1] + k3[1]))) + third * k4[1],
+        (r + third * (k1[3] + 2.0 * (k2[3] + k3[3]))) + third * k4[3],
+        third * (k1[2] + 2.0 * (k2[2] + k3[2]) + k4[2]),
+        c * ahead - s * aside,
+        s * ahead + c * aside,
     )
 
 
 @compiled
-def per_mass(p0: Any, p1: Any, p4: Any, p5: Any) -> tuple[Any, Any, Any]:
-    """Yaw inertia and cornering stiffnesses over the mass: a division less in every stage."""
-    return p1 / p0, p4 / p0, p5 / p0
+def in_half_steps(
+    half: Any, p0: Any, p1: Any, p2: Any, p3: Any, p4: Any, p5: Any, p6: Any
+) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """Parameters p1 to p6 per unit of mass p0, with `half` a step (s) as the unit of time.
+
+    Speeds stay what they are if the unit of length is what 1 m/s covers in that time; so does the
+    field, for the equations hold in any units. Yaw rates and accelerations are `half` times those
+    in SI units, lengths 1 / half times, and the yaw inertia per mass, a length squared, likewise.
+    """
+    inverse = 1.0 / half
+    stiffness = half / p0
+    return (
+        (p1 / p0) * (inverse * inverse), p2 * inverse, p3 * inverse,
+        p4 * stiffness, p5 * stiffness, p6 * half,
+    )  # fmt: skip
 
 
 @compiled
@@ -85,7 +111,10 @@ def integrate(
     """
     cd, sd = math.cos(delta), math.sin(delta)
     c, s = math.cos(psi), math.sin(psi)
-    p1, p4, p5 = per_mass(p0, p1, p4, p5)
+    half = 0.5 * h
+    p1, p2, p3, p4, p5, p6 = in_half_steps(half, p0, p1, p2, p3, p4, p5, p6)
+    a *= half
+    r *= half
     for _ in range(substeps):
         vx, vy, r, turn, dx, dy = runge_kutta(
             vx, vy, r, c, s, a, delta, cd, sd, p1, p2, p3, p4, p5, p6, h, False
@@ -94,4 +123,4 @@ def integrate(
         y += dy
         psi += turn
         c, s = rotate(c, s, turn)
-    return vx, vy, psi, r, x, y
+    return vx, vy, psi, r / half, x, y

@@ -1,20 +1,21 @@
 """Compiled kernels of path tracking: actuators, integration, projection, reward, observation.
 
 The scalar functions `actuate`, `integrate`, `observe` and `judge` are what every environment
-shares; `step` and `start` are the single environment's packed entry points. Numba's call overhead
-is per argument, so they take few arrays: the indices below name their entries.
+shares; `step` and `start` work on one episode's arrays, `advance` on all of a single environment
+packed into one array. The indices below name the arrays' entries.
 """
 
 import math
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.integration import integrate
-from lpv_track_env.observation import SCALARS
+from lpv_track_env.observation import PREVIEW_BOUNDS, SCALARS
 from lpv_track_env.reward import terms
-from trajectories.compilation import compiled, compiled_inline
+from trajectories.compilation import compiled, compiled_in_place, compiled_inline
 from trajectories.interpolation import cell, saturate, speed_in
 from trajectories.preview import fill_preview
 from trajectories.projection import SEARCH_WINDOW, follow
@@ -22,10 +23,10 @@ from trajectories.projection import SEARCH_WINDOW, follow
 Array = NDArray[Any]
 
 # Memory of an episode, (MEMORY_SIZE,) float64: the state, then
-ACCELERATION, STEERING, ARC_LENGTH, START, STEPS = 6, 7, 8, 9, 10
-# and what the last step was judged by:
-LATERAL_ERROR, HEADING_ERROR, SPEED_ERROR, REFERENCE_SPEED, CLIPPED, END, REWARD, TERMS = (
-    11, 12, 13, 14, 15, 16, 17, 18,
+ACCELERATION, STEERING, START, STEPS, REFERENCE_SPEED, END = 6, 7, 8, 9, 10, 11
+# and, from ARC_LENGTH on, what a step is reported by:
+ARC_LENGTH, LATERAL_ERROR, HEADING_ERROR, SPEED_ERROR, CLIPPED, REWARD, TERMS = (
+    12, 13, 14, 15, 16, 17, 18,
 )  # fmt: skip
 MEMORY_SIZE = 24
 
@@ -39,15 +40,25 @@ PERIOD, SUBSTEPS, PREVIEW_PERIOD, CORRIDOR, MAX_STEPS, LENGTH, CLOSED, TIGHTEST 
 START_RANGE, LATERAL_RANGE, HEADING_RANGE, SPEED_RANGE, WEIGHTS = 20, 21, 22, 23, 24
 CONSTANTS_SIZE = 35
 
+# A single environment, float64: its command [a, delta], then
+MEMORY = 2
+CONSTANTS = MEMORY + MEMORY_SIZE
+OBSERVATION = CONSTANTS + CONSTANTS_SIZE
+"""From here on float32, two numbers to an entry."""
+
 RUNNING, FINISHED, LEFT_CORRIDOR, WRONG_HEADING, NON_FINITE, TIME_LIMIT = range(6)
 END_NAMES = ("running", "finished", "left_corridor", "wrong_heading", "non_finite", "time_limit")
 """How an episode ends, by code."""
+NOT_FINITE = -1
+"""In place of such a code: the command is not finite."""
 
 RANGE_ACCELERATION, RATE_ACCELERATION, RANGE_STEERING, RATE_STEERING = 1, 2, 4, 8
 """Bits of what the actuators clipped."""
 
 MAX_HEADING_ERROR = 0.5 * math.pi
 PREVIEW_START = len(SCALARS)
+BOUNDS = tuple(bound for _, _, bound in SCALARS)
+CURVATURE_BOUND, SPEED_BOUND = (bound for _, _, bound in PREVIEW_BOUNDS)
 
 
 @compiled
@@ -81,38 +92,35 @@ def actuate(
     ranged_a, ranged_delta = clip(a, low_a, high_a), clip(delta, -max_delta, max_delta)
     rated_a = clip(ranged_a, last_a - a_step, last_a + a_step)
     rated_delta = clip(ranged_delta, last_delta - delta_step, last_delta + delta_step)
-    bits = 0
-    # A controller that drives along a bound must not be reported for its rounding.
-    if abs(ranged_a - a) > 1e-6:
-        bits += RANGE_ACCELERATION
-    if abs(rated_a - ranged_a) > 1e-6:
-        bits += RATE_ACCELERATION
-    if abs(ranged_delta - delta) > 1e-6:
-        bits += RANGE_STEERING
-    if abs(rated_delta - ranged_delta) > 1e-6:
-        bits += RATE_STEERING
+    # A controller that drives along a bound must not be reported for its rounding. In sums, for the
+    # branches would be taken at random.
+    bits = (
+        RANGE_ACCELERATION * (abs(ranged_a - a) > 1e-6)
+        + RATE_ACCELERATION * (abs(rated_a - ranged_a) > 1e-6)
+        + RANGE_STEERING * (abs(ranged_delta - delta) > 1e-6)
+        + RATE_STEERING * (abs(rated_delta - ranged_delta) > 1e-6)
+    )
     return rated_a, rated_delta, bits
 
 
 @compiled_inline
 def observe(
-    memory: Array, constants: Array, table: Array, bound: Array, observation: Array,
-    index: int, u: Any,
+    memory: Array, constants: Array, table: Array, observation: Array, index: int, u: Any
 ) -> None:  # fmt: skip
     """Write the observation (see `observation`); the foot point is at u in [0, 1] of a cell."""
     k = (observation.shape[0] - PREVIEW_START) // 2
-    observation[0] = saturate(memory[VX], bound[0])
-    observation[1] = saturate(memory[VY], bound[1])
-    observation[2] = saturate(memory[YAW_RATE], bound[2])
-    observation[3] = saturate(memory[ACCELERATION], bound[3])
-    observation[4] = saturate(memory[STEERING], bound[4])
-    observation[5] = saturate(memory[LATERAL_ERROR], bound[5])
-    observation[6] = saturate(memory[HEADING_ERROR], bound[6])
-    observation[7] = saturate(memory[REFERENCE_SPEED], bound[7])
+    observation[0] = saturate(memory[VX], BOUNDS[0])
+    observation[1] = saturate(memory[VY], BOUNDS[1])
+    observation[2] = saturate(memory[YAW_RATE], BOUNDS[2])
+    observation[3] = saturate(memory[ACCELERATION], BOUNDS[3])
+    observation[4] = saturate(memory[STEERING], BOUNDS[4])
+    observation[5] = saturate(memory[LATERAL_ERROR], BOUNDS[5])
+    observation[6] = saturate(memory[HEADING_ERROR], BOUNDS[6])
+    observation[7] = saturate(memory[REFERENCE_SPEED], BOUNDS[7])
     fill_preview(
         table, constants[LENGTH], constants[CLOSED] > 0.5, memory[ARC_LENGTH], index, u,
         constants[PREVIEW_PERIOD], observation, PREVIEW_START, k,
-        bound[PREVIEW_START], bound[PREVIEW_START + k],
+        CURVATURE_BOUND, SPEED_BOUND,
     )  # fmt: skip
 
 
@@ -158,7 +166,7 @@ def judge(memory: Array, constants: Array, finite: bool) -> int:
 
 @compiled_inline
 def finish(
-    memory: Array, constants: Array, table: Array, bound: Array, observation: Array,
+    memory: Array, constants: Array, table: Array, observation: Array,
     vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, a: Any, delta: Any, bits: int,
 ) -> int:  # fmt: skip
     """End a control period with a new state and actuators: errors, end, reward, observation.
@@ -200,18 +208,18 @@ def finish(
         total += parts[k]
     memory[REWARD] = total
     memory[END] = end
-    observe(memory, constants, table, bound, observation, index, u)
+    observe(memory, constants, table, observation, index, u)
     return end
 
 
-@compiled
-def step(
-    memory: Array, action: Array, constants: Array, table: Array, bound: Array, observation: Array
+@compiled_in_place
+def drive(
+    memory: Array, a: Any, delta: Any, constants: Array, table: Array, observation: Array
 ) -> int:
-    """One control period of the single environment, in place; returns the code of its end."""
+    """One control period of an episode under a command, in place; returns the code of its end."""
     p = constants
     a, delta, bits = actuate(
-        action[0], action[1], memory[ACCELERATION], memory[STEERING],
+        a, delta, memory[ACCELERATION], memory[STEERING],
         p[MAX_STEERING], p[STEERING_STEP], p[LOWEST_ACCELERATION], p[HIGHEST_ACCELERATION],
         p[ACCELERATION_STEP],
     )  # fmt: skip
@@ -220,16 +228,49 @@ def step(
         memory[VX], memory[VY], memory[PSI], memory[YAW_RATE], memory[X], memory[Y], a, delta,
         p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[PERIOD] / substeps, substeps,
     )  # fmt: skip
-    return finish(
-        memory, constants, table, bound, observation, vx, vy, psi, r, x, y, a, delta, bits
-    )
+    return finish(memory, constants, table, observation, vx, vy, psi, r, x, y, a, delta, bits)
 
 
 @compiled
-def start(memory: Array, constants: Array, table: Array, bound: Array, observation: Array) -> None:
+def step(
+    memory: Array, action: Array, constants: Array, table: Array, _bound: Array, observation: Array
+) -> int:
+    """One control period of an episode, in place; returns the code of its end."""
+    return drive(memory, action[0], action[1], constants, table, observation)
+
+
+@compiled
+def advance(
+    episode: Array, table: Array
+) -> tuple[int, Any, Any, Any, Any, int, Any, Any, Any, Any, Any, Any, Any]:
+    """One control period of a single environment, packed into `episode`, in place.
+
+    Returns the code of its end and the memory from ARC_LENGTH on; NOT_FINITE, and nothing is
+    changed, for a command that is not finite. A step of Python pays for each array that it hands
+    over, and more for each number that it looks up: hence all in one, and all at once.
+    """
+    a, delta = episode[0], episode[1]
+    m = episode[MEMORY:CONSTANTS]
+    if math.isfinite(a) and math.isfinite(delta):
+        end = drive(
+            m, a, delta, episode[CONSTANTS:OBSERVATION], table,
+            episode[OBSERVATION:].view(np.float32),
+        )  # fmt: skip
+    else:
+        end = NOT_FINITE
+    k = TERMS
+    return (
+        end, m[ARC_LENGTH], m[LATERAL_ERROR], m[HEADING_ERROR], m[SPEED_ERROR], int(m[CLIPPED]),
+        m[REWARD], m[k], m[k + 1], m[k + 2], m[k + 3], m[k + 4], m[k + 5],
+    )  # fmt: skip
+
+
+@compiled
+def start(memory: Array, constants: Array, table: Array, observation: Array) -> None:
     """Begin an episode from the state and actuators that `memory` holds, near its ARC_LENGTH."""
-    memory[STEPS:] = 0.0
+    near = memory[ARC_LENGTH]
+    memory[START:] = 0.0
     window = min(SEARCH_WINDOW, constants[LENGTH])
-    index, u = locate(memory, constants, table, memory[ARC_LENGTH], 0.0, window)
+    index, u = locate(memory, constants, table, near, 0.0, window)
     memory[START] = memory[ARC_LENGTH]
-    observe(memory, constants, table, bound, observation, index, u)
+    observe(memory, constants, table, observation, index, u)

@@ -17,7 +17,7 @@ def register() -> None:
             id=PATH_TRACKING,
             entry_point="lpv_track_env.env:PathTrackingEnv",
             vector_entry_point="lpv_track_env.vector_env:PathTrackingVectorEnv",
-            # The environment refuses by itself what these wrappers would, and more; each costs time.
+            # The environment refuses by itself what these wrappers would: each costs time.
             order_enforce=False,
             disable_env_checker=True,
         )

@@ -260,7 +260,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._pack_beside(tasks if tasks is not self.tasks else [], mask)
         vector_kernels.begin_all(
             mask, self._memories, self._cases, drawn, self._constants, self._tables, self._rows,
-            self._bound, self._keys, self._episodes, given, self._observations, self._ends,
+            self._keys, self._episodes, given, self._observations, self._ends,
         )  # fmt: skip
         return self._observations.copy(), episode_infos(self._memories, mask)
 
@@ -302,7 +302,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         rewards = np.empty(n)
         arguments = (
             self._mode, self._memories, commands, self._cases, self._drawn, self._constants,
-            self._tables, self._rows, self._bound, self._keys, self._episodes, self._nothing_given,
+            self._tables, self._rows, self._keys, self._episodes, self._nothing_given,
             self._observations, self._ends, rewards, self._final_memories, self._final_observations,
         )  # fmt: skip
         if self._threads == 1:

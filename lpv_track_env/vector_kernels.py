@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.episodes import TRAJECTORY_DRAW, VEHICLE_DRAW, begin, choice
-from lpv_track_env.integration import integrate, per_mass, rotate, runge_kutta
+from lpv_track_env.integration import in_half_steps, integrate, rotate, runge_kutta
 from trajectories.compilation import compiled, compiled_inline, compiled_parallel
 
 Array = NDArray[Any]
@@ -27,8 +27,8 @@ LANES = 32
 COS, SIN, ACCELERATION, STEERING, COS_STEERING, SIN_STEERING, PARAMETERS = (
     6 * LANES, 7 * LANES, 8 * LANES, 9 * LANES, 10 * LANES, 11 * LANES, 12 * LANES,
 )  # fmt: skip
-SUBSTEP, CLIPPED = 18 * LANES, 19 * LANES
-SCRATCH_SIZE = 20 * LANES
+SUBSTEP, CLIPPED, PUSH = 18 * LANES, 19 * LANES, 20 * LANES
+SCRATCH_SIZE = 21 * LANES
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)
 """When an environment that has ended is reset, as `gymnasium.vector.AutoresetMode` says."""
@@ -37,11 +37,15 @@ NEXT_STEP, SAME_STEP, DISABLED = range(3)
 @compiled
 def integrate_lanes(b: Array, substeps: int) -> None:
     """Runge-Kutta steps of all lanes of a scratch, the same number for each."""
+    for j in range(LANES):
+        half = 0.5 * b[SUBSTEP + j]
+        b[PUSH + j] = b[ACCELERATION + j] * half
+        b[YAW_RATE * LANES + j] *= half
     for _ in range(substeps):
         for j in range(LANES):
             vx, vy, r, turn, dx, dy = runge_kutta(
                 b[j], b[LANES + j], b[3 * LANES + j], b[COS + j], b[SIN + j],
-                b[ACCELERATION + j], b[STEERING + j], b[COS_STEERING + j], b[SIN_STEERING + j],
+                b[PUSH + j], b[STEERING + j], b[COS_STEERING + j], b[SIN_STEERING + j],
                 b[PARAMETERS + j], b[PARAMETERS + LANES + j], b[PARAMETERS + 2 * LANES + j],
                 b[PARAMETERS + 3 * LANES + j], b[PARAMETERS + 4 * LANES + j],
                 b[PARAMETERS + 5 * LANES + j],
@@ -53,6 +57,8 @@ def integrate_lanes(b: Array, substeps: int) -> None:
             b[4 * LANES + j] += dx
             b[5 * LANES + j] += dy
             b[COS + j], b[SIN + j] = c, s
+    for j in range(LANES):
+        b[YAW_RATE * LANES + j] /= 0.5 * b[SUBSTEP + j]
 
 
 @compiled_inline
@@ -68,12 +74,12 @@ def load_lane(b: Array, j: int, memory: Array, action: Array, p: Array) -> int:
     b[COS + j], b[SIN + j] = math.cos(memory[PSI]), math.sin(memory[PSI])
     b[ACCELERATION + j], b[STEERING + j] = a, delta
     b[COS_STEERING + j], b[SIN_STEERING + j] = math.cos(delta), math.sin(delta)
-    inertia, front, rear = per_mass(p[0], p[1], p[4], p[5])
-    b[PARAMETERS + j], b[PARAMETERS + LANES + j] = inertia, p[2]
-    b[PARAMETERS + 2 * LANES + j], b[PARAMETERS + 3 * LANES + j] = p[3], front
-    b[PARAMETERS + 4 * LANES + j], b[PARAMETERS + 5 * LANES + j] = rear, p[6]
     substeps = int(p[k.SUBSTEPS])
-    b[SUBSTEP + j] = p[k.PERIOD] / substeps
+    h = p[k.PERIOD] / substeps
+    b[SUBSTEP + j] = h
+    q = in_half_steps(0.5 * h, p[0], p[1], p[2], p[3], p[4], p[5], p[6])
+    for row in range(len(q)):
+        b[PARAMETERS + row * LANES + j] = q[row]
     b[CLIPPED + j] = bits
     return substeps
 
@@ -109,7 +115,7 @@ def first_bad(commands: Array, ends: Array, mode: int) -> int:
 @compiled
 def begin_next(
     i: int, memory: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
-    rows: Array, bound: Array, observation: Array, keys: Array, episodes: Array, given: Array,
+    rows: Array, observation: Array, keys: Array, episodes: Array, given: Array,
 ) -> None:  # fmt: skip
     """Begin the next episode of environment i, on a path and with a vehicle that are drawn.
 
@@ -124,14 +130,14 @@ def begin_next(
         case += choice(keys[i], episodes[i], VEHICLE_DRAW, vehicles)
     cases[i] = case
     table = tables[rows[case, 0] : rows[case, 1]]
-    begin(memory, constants[case], table, bound, observation, keys[i], episodes[i], given)
+    begin(memory, constants[case], table, observation, keys[i], episodes[i], given)
 
 
 @compiled
 def advance(
     first: int, last: int, mode: int,
     memories: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
-    rows: Array, bound: Array, keys: Array, episodes: Array, given: Array,
+    rows: Array, keys: Array, episodes: Array, given: Array,
     observations: Array, ends: Array, rewards: Array, final_memories: Array,
     final_observations: Array,
 ) -> None:  # fmt: skip
@@ -165,8 +171,8 @@ def advance(
             else:
                 case = cases[i]
                 ends[i] = k.finish(
-                    memory, constants[case], tables[rows[case, 0] : rows[case, 1]], bound,
-                    observation, b[VX * LANES + j], b[VY * LANES + j], b[PSI * LANES + j],
+                    memory, constants[case], tables[rows[case, 0] : rows[case, 1]], observation,
+                    b[VX * LANES + j], b[VY * LANES + j], b[PSI * LANES + j],
                     b[YAW_RATE * LANES + j], b[X * LANES + j], b[Y * LANES + j],
                     b[ACCELERATION + j], b[STEERING + j], int(b[CLIPPED + j]),
                 )  # fmt: skip
@@ -178,7 +184,7 @@ def advance(
             # One call for both modes: every call is compiled in.
             if begins:
                 begin_next(
-                    i, memory, cases, drawn, constants, tables, rows, bound, observation,
+                    i, memory, cases, drawn, constants, tables, rows, observation,
                     keys, episodes, given,
                 )  # fmt: skip
 
@@ -187,7 +193,7 @@ def advance(
 def advance_in_threads(
     chunks: int, n: int, mode: int,
     memories: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
-    rows: Array, bound: Array, keys: Array, episodes: Array, given: Array,
+    rows: Array, keys: Array, episodes: Array, given: Array,
     observations: Array, ends: Array, rewards: Array, final_memories: Array,
     final_observations: Array,
 ) -> None:  # fmt: skip
@@ -197,7 +203,7 @@ def advance_in_threads(
         first = chunk * blocks // chunks * LANES
         last = min((chunk + 1) * blocks // chunks * LANES, n)
         advance(
-            first, last, mode, memories, actions, cases, drawn, constants, tables, rows, bound,
+            first, last, mode, memories, actions, cases, drawn, constants, tables, rows,
             keys, episodes, given, observations, ends, rewards, final_memories,
             final_observations,
         )  # fmt: skip
@@ -207,13 +213,13 @@ def advance_in_threads(
 def begin_all(
     mask: Array,
     memories: Array, cases: Array, drawn: Any, constants: Array, tables: Array, rows: Array,
-    bound: Array, keys: Array, episodes: Array, given: Array, observations: Array, ends: Array,
+    keys: Array, episodes: Array, given: Array, observations: Array, ends: Array,
 ) -> None:  # fmt: skip
     """Begin the next episode of every environment that `mask` (n,) marks."""
     for i in range(mask.shape[0]):
         if mask[i]:
             ends[i] = k.RUNNING
             begin_next(
-                i, memories[i], cases, drawn, constants, tables, rows, bound, observations[i],
+                i, memories[i], cases, drawn, constants, tables, rows, observations[i],
                 keys, episodes, given,
             )  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from trajectories import compilation
-from trajectories.compilation import compiled, source_digest
+from trajectories.compilation import compiled, entry_point, source_digest
 
 
 @pytest.fixture(autouse=True)
@@ -90,6 +90,22 @@ def test_division_by_zero_gives_inf() -> None:
     assert compiled_quotient(1.0, 0.0) == math.inf
     assert compiled_quotient(-1.0, 0.0) == -math.inf
     assert math.isnan(compiled_quotient(0.0, 0.0))
+
+
+@compiled
+def first_of_sum(x: Any, y: Any) -> Any:
+    return x[0] + y
+
+
+def test_entry_point_is_the_compiled_function_for_these_types() -> None:
+    """Of each layout its own: the dispatch that it leaves out would have told them apart."""
+    row, column = np.arange(6.0), np.arange(6.0).reshape(3, 2)[1:, 1]
+    for array, wanted in ((row, 2.5), (column, 5.5)):
+        entry = entry_point(first_of_sum, array, 2.5)
+        assert entry(array, 2.5) == first_of_sum(array, 2.5) == wanted
+    assert entry_point(first_of_sum, row, 1.0) is entry_point(first_of_sum, row + 1.0, 0.0)
+    assert entry_point(first_of_sum, row, 1.0) is not entry_point(first_of_sum, column, 1.0)
+    assert entry_point(python_sum, 1.0, 2.0, 3.0) is python_sum
 
 
 def run(code: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import PassiveEnvChecker
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -125,7 +126,8 @@ def test_stable_baselines_check_env(options: dict[str, Any]) -> None:
 def test_passive_checker_finds_nothing_in_an_episode() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = gymnasium.make(PATH_TRACKING, trajectory="u-turn")
+        env = gymnasium.make(PATH_TRACKING, trajectory="u-turn", disable_env_checker=False)
+        assert isinstance(env, PassiveEnvChecker)
         observation, _ = env.reset(seed=3)
         done = False
         while not done:
@@ -308,7 +310,7 @@ def test_any_two_real_numbers_are_an_action(action: Any) -> None:
     wanted = other.step(np.array(action, dtype=np.float64))
     assert_same(env.step(action), wanted)
     # As the dynamics see it, and so neither swapped nor rounded.
-    assert env._action.tolist() == np.array(action, dtype=np.float64).tolist()
+    assert env._command[:2].tolist() == np.array(action, dtype=np.float64).tolist()
 
 
 def test_a_readonly_action_is_taken_and_left_alone() -> None:
@@ -420,6 +422,20 @@ def test_step_before_reset_and_after_the_end() -> None:
     np.testing.assert_array_equal(env.state, state)
     env.reset(seed=0)
     env.step(action)
+
+
+def test_as_made_it_is_bare_and_keeps_the_order_of_calls_itself() -> None:
+    """No wrapper of Gymnasium's stands before it: what they would refuse, it must."""
+    env = gymnasium.make(PATH_TRACKING, trajectory="straight", render_mode="rgb_array")
+    assert env.unwrapped is env
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"call reset\(\) before step"):
+        env.step(env.action_space.sample())
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"call reset\(\) before render"):
+        env.render()
+    env.reset(seed=0)
+    frame: Any = env.render()
+    assert frame.shape == (600, 900, 3)
+    env.close()
 
 
 # Ends ----------------------------------------------------------------------------------------

@@ -72,7 +72,7 @@ def test_start_lies_at_the_errors_asked_for() -> None:
     memory, observation = np.full(kernels.MEMORY_SIZE, 7.0), np.zeros(48, np.float32)
     given = np.array([12.0, 0.5, -0.2, 1.5])
     episodes.begin(
-        memory, env.task.constants(), env.path.table, env.layout.bound, observation,
+        memory, env.task.constants(), env.path.table, observation,
         np.uint64(0), 0, given,
     )  # fmt: skip
     radius = math.hypot(memory[4], memory[5] - 30.0)
@@ -82,5 +82,6 @@ def test_start_lies_at_the_errors_asked_for() -> None:
     assert memory[0] == pytest.approx(float(env.path.sample(12.0).speed) + 1.5)
     assert memory[kernels.ARC_LENGTH] == pytest.approx(12.0, abs=1e-9)
     assert memory[kernels.ACCELERATION] == env.vehicle.rolling_deceleration
-    assert not memory[kernels.STEPS : kernels.LATERAL_ERROR].any()
-    assert not memory[kernels.CLIPPED :].any()
+    assert memory[kernels.START] == memory[kernels.ARC_LENGTH]
+    assert memory[kernels.STEPS] == 0.0
+    assert not memory[[kernels.END, *range(kernels.CLIPPED, kernels.MEMORY_SIZE)]].any()

@@ -30,6 +30,8 @@ def fill_preview(
     within their bounds.
     """
     n = table.shape[0]
+    # It never is negative, but only so compiled code knows and does not look at every access.
+    index = max(index, 0)
     h = length / (n - 1)
     inverse, quarter = 1.0 / h, 0.25 * (n - 1) / length
     # In one type: comparisons of mixed ones cost conversions.
