@@ -161,7 +161,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         ValueError
             If the observation does not have this agent's layout.
         """
-        rows = np.asarray(observation, dtype=np.float64)
+        rows = np.array(observation, dtype=np.float64, order="C")
         single = rows.ndim == 1
         if single:
             rows = rows.reshape(1, -1)
