@@ -10,7 +10,7 @@ from nmpc_situations import WEIGHTS
 from numpy.typing import NDArray
 
 import agents
-from agents.nmpc.closed_loop import ClosedLoop, Tally
+from agents.nmpc.closed_loop import ClosedLoop, Tally, drive_rows
 from agents.nmpc.rti_agent import RtiNmpc
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env import kernels as k
@@ -141,6 +141,20 @@ def test_weights_for_all_and_the_agents_own() -> None:
     assert not np.array_equal(rows[1], rows[2])
     own.reset(seed=1)
     np.testing.assert_array_equal(own.drive(10, np.tile(other.as_array(), (3, 1))), rows[2])
+
+
+def test_any_array_of_weights_does() -> None:
+    """None has the loop compiled for it anew."""
+    loop, sets = loop_of(3, CALM), weights_of(3)
+    loop.reset(seed=1)
+    wanted = loop.drive(5, sets)
+    known = len(drive_rows.signatures)  # type: ignore[attr-defined]
+    fixed = sets.copy()
+    fixed.flags.writeable = False
+    for same in (np.asfortranarray(sets), np.repeat(sets, 2, axis=1)[:, ::2], sets.tolist(), fixed):
+        loop.reset(seed=1)
+        np.testing.assert_array_equal(loop.drive(5, same), wanted)
+        assert len(drive_rows.signatures) == known  # type: ignore[attr-defined]
 
 
 def test_cutting_a_drive_into_calls_changes_nothing() -> None:
