@@ -202,6 +202,11 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         return self._packed[int(self._cases[index])]
 
     @property
+    def begun(self) -> bool:
+        """Whether every environment has had a reset."""
+        return bool(self._episodes.min() >= 0)
+
+    @property
     def single(self) -> PathTrackingEnv:
         """A single environment of the same settings, the first path and vehicle: for agents."""
         return self._single

@@ -8,6 +8,7 @@ whatever n is and however many threads share the work.
 import os
 from typing import Any, NamedTuple
 
+import gymnasium
 import numba
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -218,6 +219,8 @@ class ClosedLoop:
             For weights of a wrong shape or value, or an array to trace into of a wrong shape.
         """
         n = self.envs.num_envs
+        if not self.envs.begun:
+            raise gymnasium.error.ResetNeeded("the episodes have not begun: call reset() first")
         sets = self._checked_weights(weights)
         if trace is None:
             trace = np.empty((n, 0, k.MEMORY_SIZE))
@@ -254,6 +257,11 @@ class ClosedLoop:
 
     def _checked_weights(self, weights: ArrayLike | None) -> Array:
         if weights is None:
+            if self.agent.has_schedule:
+                raise ValueError(
+                    "the agent's weights come from a schedule, which predict follows: give drive "
+                    "its weights"
+                )
             return self.agent.fixed_weights
         values = np.atleast_2d(np.asarray(weights, dtype=np.float64))
         n = self.envs.num_envs
@@ -263,4 +271,5 @@ class ClosedLoop:
         if bad.any():
             row = int(np.argmax(bad))
             raise ValueError(f"weights of environment {row} must be finite and >= 0: {values[row]}")
-        return np.ascontiguousarray(values)
+        # A copy: one compiled form takes it, whatever array it came in.
+        return np.array(values, order="C")

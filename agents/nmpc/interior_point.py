@@ -1,7 +1,8 @@
-"""Primal-dual interior-point method for the NMPC's quadratic program, compiled.
+"""Interior-point steps for the NMPC's quadratic program, compiled.
 
-Mehrotra's predictor and corrector on Riccati recursions (`riccati`), from an infeasible start. Every
-inequality is a pair (t, lam) with t lam -> 0; with "gap" for the distance to a bound, per stage::
+Mehrotra's predictor and corrector on Riccati recursions (`riccati`), from an infeasible start.
+Every
+inequality is a pair (t, lam) with t lam -> 0; rows as in `program`::
 
      0.. 7   high, low of a, delta, a - a_before, delta - delta_before        t = gap
      8.. 9   high, low of vx at the period's end,         10  its slack       t = gap + slack
@@ -14,218 +15,37 @@ multiplier that a step of no length would give, its step is
     ds = (sum b - linear - quadratic s - sum w dgap) / (quadratic + sum w)
 
 over its pairs and its own bound. What the Riccati recursion sees is then a Hessian and a gradient
-by stage. Before all this, the plan without inequalities is tried: where it keeps them it is the
-solution, to rounding.
-
-The model is that of `linearisation`; all arrays are carved out of one workspace.
+by stage.
 """
 
-import math
 from typing import Any
 
 from numpy.typing import NDArray
 
-from agents.nmpc import riccati
-from agents.nmpc.linearisation import RATE, RATE_DELTA, RATE_R, RATE_VX, RATE_VY
-from agents.nmpc.riccati import BARRIER, GAIN, SLOPE
-from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
-from trajectories.compilation import compiled, compiled_in_place
+from agents.nmpc.linearisation import RATE_DELTA, RATE_R, RATE_VX, RATE_VY
+from agents.nmpc.program import (
+    HIGH_A,
+    LINEAR,
+    LOW_A,
+    MAX_DELTA,
+    PAIRS,
+    QUADRATIC,
+    RATIO,
+    STEP_A,
+    STEP_DELTA,
+)
+from lpv_track_env.bicycle import VX, VY, YAW_RATE
+from trajectories.compilation import compiled
 
 Array = NDArray[Any]
 Float = Any
 
-PAIRS = 17
-SOFT_PAIRS = ((8, 9, 10), (11, 12, 13), (14, 15, 16))
-"""First and second pair and slack of each soft constraint: on vx, vx', vy."""
 FUNCTIONALS = 8
 """Rows of a step: a, delta, their changes, vx, vx', ratio vx - vy, ratio vx + vy."""
-
-# Numbers of the problem, (LIMITS_SIZE,): see `rti_solver.limits`.
-(
-    LOW_A, HIGH_A, MAX_DELTA, STEP_A, STEP_DELTA, FIRST_STEP_A, FIRST_STEP_DELTA, LOW_SPEED,
-    HIGH_SPEED, LOW_RATE, HIGH_RATE, RATIO, LINEAR, QUADRATIC, DAMPING_A, DAMPING_DELTA,
-) = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 15, 18, 19)  # fmt: skip
-LIMITS_SIZE = 20
-SLACK_OF = (0, 2, 1)
-"""Index in the problem's penalties (vx, vy, vx') of the soft constraints in their order here."""
-
-OPTIMAL, OUT_OF_ITERATIONS, BROKEN = 0, 1, 2
-GUESSING, PREDICTING, CORRECTING = 0, 1, 2
-"""Phases: the active-set method, then predictor and corrector in turns."""
-FREE, BINDING, BROKEN_SOFT = 0.0, 1.0, 2.0
-"""What a guess makes of a constraint: it is kept by itself, holds as an equation, is broken."""
-MAX_GUESSES = 6
-NEAR = 1e-4
-"""Gap below which a constraint of the plan is guessed to bind."""
-HELD = 1e-9
-"""Largest gap of a constraint that binds."""
-SLIGHT = 1e-9
-STIFFNESS = 1e7
-MAX_ITERATIONS = 40
 START_BARRIER = 300.0
+"""Product t lam at the start."""
 START_DISTANCE = 1.0
 """Least t at the start, as a share of the range between a pair's bounds."""
-CAUTION, LEAST_CAUTION = 0.995, 0.9999
-"""Share of the way to the nearest bound, at first and near the solution."""
-ACCEPTABLE = 1e-6
-"""Mean product at which rounding may end the iterations."""
-
-
-@compiled
-def workspace_size(n: int) -> int:
-    """Length of the workspace of `solve_qp` for N = n."""
-    return 6 * (n + 1) + (2 + GAIN + BARRIER + SLOPE + 10 * PAIRS + FUNCTIONALS + 6 + 1) * n
-
-
-@compiled
-def measure_gaps(
-    records: Array, base: Array, plan: Array, states: Array, inputs: Array, last: Array,
-    limits: Array, gaps: Array,
-) -> Float:  # fmt: skip
-    """Fill the gaps (PAIRS, N) of linearised constraints; the rows of slacks are left alone.
-
-    `base` (N + 1, 6) and `plan` (N, 2) are what the records were made along. Returns the least gap.
-    """
-    n = inputs.shape[0]
-    low_a, high_a, max_delta = limits[LOW_A], limits[HIGH_A], limits[MAX_DELTA]
-    ratio, least = limits[RATIO], math.inf
-    before_a, before_delta = last[0], last[1]
-    step_a, step_delta = limits[FIRST_STEP_A], limits[FIRST_STEP_DELTA]
-    for i in range(n):
-        a, delta, e = inputs[i, 0], inputs[i, 1], records[i]
-        gaps[0, i], gaps[1, i] = high_a - a, a - low_a
-        gaps[2, i], gaps[3, i] = max_delta - delta, delta + max_delta
-        change_a, change_delta = a - before_a, delta - before_delta
-        gaps[4, i], gaps[5, i] = step_a - change_a, change_a + step_a
-        gaps[6, i], gaps[7, i] = step_delta - change_delta, change_delta + step_delta
-        vx, vy = states[i + 1, VX], states[i + 1, VY]
-        gaps[8, i], gaps[9, i] = limits[HIGH_SPEED] - vx, vx - limits[LOW_SPEED]
-        rate = e[RATE] + e[RATE_VX] * (states[i, VX] - base[i, VX])
-        rate += e[RATE_VY] * (states[i, VY] - base[i, VY])
-        rate += e[RATE_R] * (states[i, YAW_RATE] - base[i, YAW_RATE])
-        rate += a - plan[i, 0] + e[RATE_DELTA] * (delta - plan[i, 1])
-        gaps[11, i], gaps[12, i] = limits[HIGH_RATE] - rate, rate - limits[LOW_RATE]
-        gaps[14, i], gaps[15, i] = ratio * vx - vy, ratio * vx + vy
-        before_a, before_delta = a, delta
-        step_a, step_delta = limits[STEP_A], limits[STEP_DELTA]
-        for k in range(8):
-            least = min(least, gaps[k, i])
-        for k in (8, 9, 11, 12, 14, 15):
-            least = min(least, gaps[k, i])
-    return least
-
-
-@compiled
-def guess(gaps: Array, mode: Array, lam: Array) -> None:
-    """Guess which constraints hold as equations, or are broken, from a plan's gaps."""
-    for k in range(PAIRS):
-        row, into, multiplier = gaps[k], mode[k], lam[k]
-        soft = k >= 8
-        for i in range(gaps.shape[1]):
-            multiplier[i] = 0.0
-            into[i] = FREE
-            if row[i] < NEAR:
-                into[i] = BROKEN_SOFT if soft and row[i] < -NEAR else BINDING
-    for k in (10, 13, 16):
-        mode[k] = FREE
-
-
-@compiled
-def hold(
-    gaps: Array, mode: Array, lam: Array, limits: Array, weight: Array, base: Array,
-    barrier: Array, slope: Array,
-) -> None:  # fmt: skip
-    """Fill `barrier` and `slope` for an equality-constrained step.
-
-    Binding constraints by an augmented Lagrangian, broken soft ones by their price.
-    """
-    n = gaps.shape[1]
-    for k in range(PAIRS):
-        row, into, multiplier, wk, bk = gaps[k], mode[k], lam[k], weight[k], base[k]
-        linear = quadratic = 0.0
-        if k >= 8:
-            linear, quadratic = limits[LINEAR + (k - 8) // 3], limits[QUADRATIC + (k - 8) // 3]
-        for i in range(n):
-            wk[i] = STIFFNESS if into[i] == BINDING else 0.0
-            bk[i] = multiplier[i] - STIFFNESS * row[i] if into[i] == BINDING else 0.0
-            wk[i] = quadratic if into[i] == BROKEN_SOFT else wk[i]
-            bk[i] = linear - quadratic * row[i] if into[i] == BROKEN_SOFT else bk[i]
-    ratio = limits[RATIO]
-    for i in range(n):
-        for f in range(4):
-            slope[f, i] = base[2 * f, i] - base[2 * f + 1, i]
-            barrier[f, i] = weight[2 * f, i] + weight[2 * f + 1, i]
-        slope[4, i], barrier[4, i] = base[11, i] - base[12, i], weight[11, i] + weight[12, i]
-        right, left, both = base[14, i], base[15, i], weight[14, i] + weight[15, i]
-        slope[5, i] = base[8, i] - base[9, i] - ratio * (right + left)
-        slope[6, i] = right - left
-        barrier[5, i] = weight[8, i] + weight[9, i] + ratio * ratio * both
-        barrier[6, i] = ratio * (weight[15, i] - weight[14, i])
-        barrier[7, i] = both
-
-
-@compiled
-def revise(gaps: Array, mode: Array, lam: Array, limits: Array) -> tuple[bool, Float]:
-    """Mend the guess after a step; whether it changed, and by how much what binds is missed."""
-    changed, off = False, 0.0
-    for k in range(PAIRS):
-        row, into, multiplier = gaps[k], mode[k], lam[k]
-        linear = limits[LINEAR + (k - 8) // 3] if k >= 8 else math.inf
-        if k in {10, 13, 16}:
-            continue
-        for i in range(gaps.shape[1]):
-            gap, was = row[i], into[i]
-            if was == FREE:
-                if gap < -HELD:
-                    into[i], multiplier[i], changed = BINDING, 0.0, True
-            elif was == BINDING:
-                force = multiplier[i] - STIFFNESS * gap
-                if force < -SLIGHT:
-                    into[i], multiplier[i], changed = FREE, 0.0, True
-                elif force > linear:
-                    into[i], changed = BROKEN_SOFT, True
-                else:
-                    multiplier[i] = force
-                    off = max(off, abs(gap))
-            elif gap > HELD:
-                into[i], multiplier[i], changed = BINDING, linear, True
-    return changed, off
-
-
-@compiled
-def clamp(inputs: Array, last: Array, limits: Array) -> None:
-    """Bring inputs (N, 2) within their bounds and rates, from the first on."""
-    before_a, before_delta = last[0], last[1]
-    step_a, step_delta = limits[FIRST_STEP_A], limits[FIRST_STEP_DELTA]
-    for i in range(inputs.shape[0]):
-        a = min(max(inputs[i, 0], before_a - step_a), before_a + step_a)
-        delta = min(max(inputs[i, 1], before_delta - step_delta), before_delta + step_delta)
-        before_a = min(max(a, limits[LOW_A]), limits[HIGH_A])
-        before_delta = min(max(delta, -limits[MAX_DELTA]), limits[MAX_DELTA])
-        inputs[i, 0], inputs[i, 1] = before_a, before_delta
-        step_a, step_delta = limits[STEP_A], limits[STEP_DELTA]
-
-
-@compiled
-def follow(records: Array, base: Array, plan: Array, inputs: Array, states: Array) -> None:
-    """Fill states (N + 1, 6) by the linearised model under inputs (N, 2)."""
-    for k in range(6):
-        states[0, k] = base[0, k]
-    for i in range(inputs.shape[0]):
-        e = records[i]
-        d0 = states[i, VX] - base[i, VX]
-        d1 = states[i, VY] - base[i, VY]
-        d2 = states[i, PSI] - base[i, PSI]
-        d3 = states[i, YAW_RATE] - base[i, YAW_RATE]
-        ua, ud = inputs[i, 0] - plan[i, 0], inputs[i, 1] - plan[i, 1]
-        following, there = states[i + 1], base[i + 1]
-        for k in range(6):
-            following[k] = there[k] + (
-                e[k] * d0 + e[6 + k] * d1 + e[12 + k] * d3 + e[20 + k] * ua + e[26 + k] * ud
-            )
-        following[PSI] += d2
-        following[X] += e[18] * d2 + (states[i, X] - base[i, X])
-        following[Y] += e[19] * d2 + (states[i, Y] - base[i, Y])
 
 
 @compiled
@@ -393,125 +213,8 @@ def expand(
     return 1.0 / worst
 
 
-@compiled_in_place
-def solve_qp(
-    records: Array, base_states: Array, plan: Array, last: Array, reference: Array, weights: Array,
-    limits: Array, tolerance: Float, states: Array, inputs: Array, slack: Array, work: Array,
-) -> tuple[int, int]:  # fmt: skip
-    """Solve the program linearised along (base_states, plan); returns a code and iterations.
-
-    Fills states (N + 1, 6), inputs (N, 2) and slack (3, N) [vx, vx', vy] with the solution. `last`
-    is the input in force, `weights` (10,) are Q, S, R, `limits` (LIMITS_SIZE,) the problem's
-    numbers, `work` (workspace_size(N),).
-    """
-    n = plan.shape[0]
-    damping_a, damping_delta = limits[DAMPING_A], limits[DAMPING_DELTA]
-    at = 0
-    dx = work[at : at + 6 * (n + 1)].reshape(n + 1, 6)
-    at += 6 * (n + 1)
-    du = work[at : at + 2 * n].reshape(n, 2)
-    at += 2 * n
-    gains = work[at : at + GAIN * n].reshape(n, GAIN)
-    at += GAIN * n
-    barrier = work[at : at + BARRIER * n].reshape(BARRIER, n)
-    at += BARRIER * n
-    slope = work[at : at + SLOPE * n].reshape(SLOPE, n)
-    at += SLOPE * n
-    pairs = work[at : at + 10 * PAIRS * n].reshape(10, PAIRS, n)
-    gaps, t, lam, residual = pairs[0], pairs[1], pairs[2], pairs[3]
-    inverse, weight, base, dt, dlam = pairs[4], pairs[5], pairs[6], pairs[7], pairs[8]
-    mode = pairs[9]
-    at += 10 * PAIRS * n
-    functionals = work[at : at + FUNCTIONALS * n].reshape(FUNCTIONALS, n)
-    at += FUNCTIONALS * n
-    eliminated = work[at : at + 6 * n].reshape(6, n)
-    at += 6 * n
-    longest = work[at : at + n]
-
-    for i in range(n):
-        inputs[i, 0], inputs[i, 1] = plan[i, 0], plan[i, 1]
-    for i in range(n + 1):
-        for k in range(6):
-            states[i, k] = base_states[i, k]
-    mu, centre, worst, share = START_BARRIER, 0.0, 0.0, 1.0
-    phase, tries, iterations = GUESSING, 0, 0
-    changed = True
-    # All methods take turns through one loop: each part is called from one place only, which
-    # halves the time that compiling takes.
-    while True:
-        if phase == GUESSING:
-            if tries == 0:
-                measure_gaps(records, base_states, plan, states, inputs, last, limits, gaps)
-                guess(gaps, mode, lam)
-            hold(gaps, mode, lam, limits, weight, base, barrier, slope)
-        else:
-            condense(
-                t, lam, residual, share, centre, dt, phase == PREDICTING, limits, inverse, weight,
-                base, eliminated, barrier, slope,
-            )  # fmt: skip
-        if phase == PREDICTING or (phase == GUESSING and changed):
-            riccati.factor(records, weights, damping_a, damping_delta, barrier, gains)
-        riccati.solve(
-            records, gains, weights, damping_a, damping_delta, states, inputs, plan, reference,
-            slope, dx, du,
-        )  # fmt: skip
-        length = 1.0
-        if phase != GUESSING:
-            length = expand(
-                records, dx, du, t, lam, residual, share, limits, inverse, weight, base,
-                eliminated, functionals, dt, dlam, longest,
-            )  # fmt: skip
-        if phase == PREDICTING:
-            centre = _centre(t, lam, dt, dlam, min(1.0, length), mu, longest)
-            phase = CORRECTING
-            continue
-        total = 0.0
-        for i in range(n):
-            total += du[i, 0] + du[i, 1] + dx[i + 1, X]
-        if not math.isfinite(total):
-            good = phase != GUESSING and mu <= ACCEPTABLE and share * worst <= ACCEPTABLE
-            code = OPTIMAL if good else BROKEN
-            return _finish(t, inputs, last, limits, slack, code), iterations
-        if phase == CORRECTING:
-            length = min(1.0, max(CAUTION, min(1.0 - mu, LEAST_CAUTION)) * length)
-            mu = _update(t, lam, dt, dlam, length, longest)
-            share *= 1.0 - length
-        for i in range(n):
-            inputs[i, 0] += length * du[i, 0]
-            inputs[i, 1] += length * du[i, 1]
-        for i in range(n + 1):
-            for k in range(6):
-                states[i, k] += length * dx[i, k]
-        iterations += 1
-        if phase == CORRECTING:
-            if mu <= tolerance and share * worst <= tolerance:
-                return _finish(t, inputs, last, limits, slack, OPTIMAL), iterations
-            if iterations >= MAX_ITERATIONS:
-                good = mu <= ACCEPTABLE and share * worst <= ACCEPTABLE
-                code = OPTIMAL if good else OUT_OF_ITERATIONS
-                return _finish(t, inputs, last, limits, slack, code), iterations
-            phase = PREDICTING
-            continue
-        tries += 1
-        measure_gaps(records, base_states, plan, states, inputs, last, limits, gaps)
-        changed, off = revise(gaps, mode, lam, limits)
-        if not changed and off <= HELD:
-            for soft in range(3):
-                for i in range(n):
-                    least = min(gaps[8 + 3 * soft, i], gaps[9 + 3 * soft, i])
-                    t[10 + 3 * soft, i] = max(-least, 0.0)
-            return _finish(t, inputs, last, limits, slack, OPTIMAL), iterations
-        if tries == MAX_GUESSES:
-            # Start the interior-point method where all inputs keep their limits.
-            clamp(inputs, last, limits)
-            follow(records, base_states, plan, inputs, states)
-            measure_gaps(records, base_states, plan, states, inputs, last, limits, gaps)
-            worst = start(gaps, limits, t, lam, residual)
-            phase = PREDICTING
-
-
 @compiled
-def _update(t: Array, lam: Array, dt: Array, dlam: Array, length: Float, product: Array) -> Float:
+def update(t: Array, lam: Array, dt: Array, dlam: Array, length: Float, product: Array) -> Float:
     """Take a step of all pairs; returns the mean product t lam. `product` (N,) is scratch."""
     product[:] = 0.0
     for k in range(PAIRS):
@@ -524,7 +227,7 @@ def _update(t: Array, lam: Array, dt: Array, dlam: Array, length: Float, product
 
 
 @compiled
-def _centre(
+def centre_of(
     t: Array, lam: Array, dt: Array, dlam: Array, length: Float, mu: Float, reached: Array,
 ) -> Float:  # fmt: skip
     """Mehrotra's target for the products; turns `dt` into the second-order corrections dt dlam."""
@@ -544,12 +247,3 @@ def _sum(values: Array) -> Float:
     for i in range(values.shape[0]):
         total += values[i]
     return total
-
-
-@compiled
-def _finish(t: Array, inputs: Array, last: Array, limits: Array, slack: Array, code: int) -> int:
-    for soft in range(3):
-        for i in range(slack.shape[1]):
-            slack[soft, i] = t[10 + 3 * soft, i]
-    clamp(inputs, last, limits)
-    return code

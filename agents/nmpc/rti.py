@@ -12,20 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc.interior_point import (
+from agents.nmpc.linearisation import RECORD, SCRATCH, differentiate_along
+from agents.nmpc.program import (
     HIGH_A,
     LIMITS_SIZE,
     LINEAR,
     LOW_A,
     MAX_DELTA,
-    OPTIMAL,
-    OUT_OF_ITERATIONS,
     QUADRATIC,
     clamp,
-    solve_qp,
-    workspace_size,
 )
-from agents.nmpc.linearisation import RECORD, SCRATCH, differentiate_along
+from agents.nmpc.qp import OPTIMAL, OUT_OF_ITERATIONS, solve_qp, workspace_size
 from agents.reference import NODE, fill_nodes
 from lpv_track_env.bicycle import (
     PSI,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Action, DrivingTask
-from agents.nmpc import interior_point, rti
+from agents.nmpc import program, rti
 from agents.nmpc.base import Ladder, NmpcAgent
 from agents.nmpc.problem import INPUTS, STATES
 from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
@@ -165,8 +165,11 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         single = rows.ndim == 1
         if single:
             rows = rows.reshape(1, -1)
-        if rows.shape[1] != self._size:
-            self.task.layout.unpack(observation)  # raises, saying what is wrong
+        if rows.ndim != 2 or rows.shape[1] != self._size:
+            raise ValueError(
+                f"observation has shape {np.shape(observation)}, this layout has {self._size} "
+                "entries, alone or in rows: make the agent for this environment"
+            )
         n = rows.shape[0]
         memory = self._memory if state is None else state
         if memory is None or len(memory) != n:
@@ -204,6 +207,11 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         return weights
 
     @property
+    def has_schedule(self) -> bool:
+        """Whether weights are chosen by curvature at every step."""
+        return self._schedule is not None
+
+    @property
     def fixed_weights(self) -> Array:
         """Q, S, R in use where no schedule chooses, (1, 10)."""
         return self._rows
@@ -237,7 +245,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         told = batch.told[row]
         status = STATUS[int(told[rti.CODE])]
         solved = int(told[rti.CODE]) == rti.SUCCESS
-        order = np.array(interior_point.SLACK_OF)
+        order = np.array(program.SLACK_OF)
         ladder = batch.ladders.get(row)
         return {
             "status": status.value,
@@ -245,6 +253,6 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             "iterations": int(told[rti.INNER]),
             "cost": float(told[rti.COST]),
             "slack": told[rti.SLACK : rti.SLACK + 3][order] if solved else None,
-            "fallback": "" if ladder is None else ladder.fallback,
+            "fallback": "" if solved or ladder is None else ladder.fallback,
             "plan": batch.states[row, :, 4:].copy() if solved else None,
         }

@@ -5,7 +5,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc import interior_point, linearisation, rti, sqp
+from agents.nmpc import linearisation, program, qp, rti, sqp
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import INPUTS, STATES, NmpcProblem, Solution, Status
 
@@ -22,12 +22,12 @@ DAMPING = (0.0, 0.0)
 
 
 def limits(problem: NmpcProblem, damping: tuple[float, float]) -> Array:
-    """Numbers of the quadratic program as `interior_point` takes them, (LIMITS_SIZE,)."""
+    """Numbers of the quadratic program as `program` takes them, (LIMITS_SIZE,)."""
     car = problem.vehicle
     first, steps = problem.input_steps[0], problem.input_steps[-1]
     if problem.horizon == 1:
         steps = first
-    order = np.array(interior_point.SLACK_OF)
+    order = np.array(program.SLACK_OF)
     return np.array(
         [
             *car.acceleration_range,
@@ -76,7 +76,7 @@ class RtiSolver:
     ) -> None:
         if iterations < 1:
             raise ValueError(f"iterations must be at least 1, not {iterations}")
-        if not min(damping) >= 0.0:
+        if not all(value >= 0.0 for value in damping):
             raise ValueError(f"damping must not be negative, not {damping}")
         if not tolerance > 0.0:
             raise ValueError(f"tolerance must be positive, not {tolerance}")
@@ -156,7 +156,7 @@ class RtiSolver:
             status,
             plan,
             self._states.copy(),
-            self._slack[list(interior_point.SLACK_OF)].T.copy(),
+            self._slack[list(program.SLACK_OF)].T.copy(),
             cost,
             iterations,
             seconds,
@@ -165,7 +165,7 @@ class RtiSolver:
 
     def _bounded(self, inputs: Array, last: Array) -> Array:
         bounded = np.ascontiguousarray(inputs, dtype=np.float64)
-        interior_point.clamp(bounded, last, self.constants[rti.LIMITS :])
+        program.clamp(bounded, last, self.constants[rti.LIMITS :])
         return bounded
 
     def _price(
@@ -174,7 +174,7 @@ class RtiSolver:
         state: Array,
         last: Array,
         reference: Array,
-        weights: Array,  # noqa: ARG002
+        weights: Array,
     ) -> float:
         """Exact cost of a plan; its roll-out and slack are left in this solver's arrays."""
         self._states[0] = state
@@ -197,16 +197,16 @@ class RtiSolver:
         base, records = self._records(state, plan)
         n = self.problem.horizon
         found, states, slack = np.zeros((n, INPUTS)), np.zeros((n + 1, STATES)), np.zeros((3, n))
-        code, _ = interior_point.solve_qp(
+        code, _ = qp.solve_qp(
             records, base, plan, np.asarray(last_input, dtype=np.float64),
             np.ascontiguousarray(reference, dtype=np.float64),
             np.asarray(weights, dtype=np.float64), self.constants[rti.LIMITS :],
             self.constants[rti.TOLERANCE], states, found, slack, self._work,
         )  # fmt: skip
         status = {
-            interior_point.OPTIMAL: Status.SUCCESS,
-            interior_point.OUT_OF_ITERATIONS: Status.MAXITER,
-            interior_point.BROKEN: Status.QP_FAILURE,
+            qp.OPTIMAL: Status.SUCCESS,
+            qp.OUT_OF_ITERATIONS: Status.MAXITER,
+            qp.BROKEN: Status.QP_FAILURE,
         }[code]
         return status, found
 

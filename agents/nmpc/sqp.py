@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc.interior_point import HIGH_RATE, HIGH_SPEED, LOW_RATE, LOW_SPEED, RATIO
 from agents.nmpc.problem import Status
+from agents.nmpc.program import HIGH_RATE, HIGH_SPEED, LOW_RATE, LOW_SPEED, RATIO
 from agents.nmpc.rti import LIMITS, cost_of
 from lpv_track_env.bicycle import VX, VY, YAW_RATE, compiled_field, compiled_inverse_speed
 from trajectories.compilation import compiled
