@@ -235,7 +235,10 @@ def drive(
 def step(
     memory: Array, action: Array, constants: Array, table: Array, _bound: Array, observation: Array
 ) -> int:
-    """One control period of an episode, in place; returns the code of its end."""
+    """One control period of an episode, in place; returns the code of its end.
+
+    `_bound` is not read: entries of the observation saturate at their own bounds.
+    """
     return drive(memory, action[0], action[1], constants, table, observation)
 
 

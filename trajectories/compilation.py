@@ -54,7 +54,10 @@ class _Announcement(event.Listener):
 
     def on_start(self, event: event.Event) -> None:
         function = getattr(event.data.get("dispatcher"), "py_func", None)
-        if self.said or getattr(function, "__module__", "").partition(".")[0] not in PACKAGES:
+        if (
+            self.said
+            or (getattr(function, "__module__", "") or "").partition(".")[0] not in PACKAGES
+        ):
             return
         self.said = True
         print(
@@ -68,7 +71,7 @@ class _Announcement(event.Listener):
 
 
 PACKAGES = ("trajectories", "lpv_track_env", "agents", "experiments")
-event.register("numba:compile", _Announcement())
+event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]
 
 
 def compiled(function: Function) -> Function:

@@ -1,4 +1,4 @@
-"""What every NMPC agent has, whatever solves its problem: settings, weights, what to do on failure."""
+"""What every NMPC agent has, whatever solves its problem: settings, weights, failure ladder."""
 
 from abc import ABC
 from collections import Counter

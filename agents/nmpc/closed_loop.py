@@ -251,7 +251,7 @@ class ClosedLoop:
         before = numba.get_num_threads()
         numba.set_num_threads(self._threads)
         try:
-            drive_in_threads(self._threads, n, *arguments, self._work)
+            drive_in_threads(self._threads, n, *arguments, self._work)  # type: ignore[call-arg]
         finally:
             numba.set_num_threads(before)
 

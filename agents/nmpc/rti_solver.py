@@ -144,11 +144,11 @@ class RtiSolver:
             status, plan, iterations = sqp.converge(
                 self._bounded(plan, last),
                 lambda about: self.solve_qp(*given, about),
-                lambda inputs: self._price(inputs, *given),
+                lambda inputs: self._price(inputs, given),
                 lambda inputs: self._bounded(inputs, last),
                 self._iterations,
             )
-            cost = self._price(plan, *given)
+            cost = self._price(plan, given)
         seconds = time.perf_counter() - began
         if status is not Status.SUCCESS:
             return Solution(status, None, None, None, np.nan, iterations, seconds), None
@@ -168,15 +168,9 @@ class RtiSolver:
         program.clamp(bounded, last, self.constants[rti.LIMITS :])
         return bounded
 
-    def _price(
-        self,
-        inputs: Array,
-        state: Array,
-        last: Array,
-        reference: Array,
-        weights: Array,
-    ) -> float:
+    def _price(self, inputs: Array, given: tuple[Array, Array, Array, Array]) -> float:
         """Exact cost of a plan; its roll-out and slack are left in this solver's arrays."""
+        state, _, reference, weights = given
         self._states[0] = state
         constants = self.constants
         linearisation.roll_out(

@@ -8,6 +8,7 @@ Numer. Anal. 49, 2011), taken only where the exact cost falls, and else shortene
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -119,7 +120,7 @@ def converge(
 
 def _mixed(plans: list[Array], steps: list[Array]) -> Array:
     """Anderson's next plan: the step that is least, to first order, among mixtures."""
-    changes = np.array([b - a for a, b in zip(steps[:-1], steps[1:], strict=True)])
-    moves = np.array([b - a for a, b in zip(plans[:-1], plans[1:], strict=True)])
+    changes = np.array([b - a for a, b in pairwise(steps)])
+    moves = np.array([b - a for a, b in pairwise(plans)])
     shares = np.linalg.lstsq(changes.reshape(len(changes), -1).T, steps[-1].ravel(), rcond=1e-10)[0]
     return plans[-1] + steps[-1] - np.tensordot(shares, moves + changes, axes=1)

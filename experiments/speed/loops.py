@@ -21,7 +21,8 @@ def loops(section: Section, effort: Effort, tick: Tick) -> None:
     """Compiled closed loops over the number of environments and threads."""
     section.notes.append(
         "Seconds per control period of one environment, NMPC and plant together: calls of "
-        f"{PERIODS} periods on {' and '.join(effort.trajectories)}, every environment with its own weights, "
+        f"{PERIODS} periods on {' and '.join(effort.trajectories)}, every environment with "
+        "its own weights, "
         "started anywhere on its path with some error. Resets stand outside the clock."
     )
     for n in effort.batches:
