@@ -84,10 +84,7 @@ def test_understeer_gradient_is_that_of_the_field(
         rate = derivative([speed, vy, 0.0, r, 0.0, 0.0], [0.0, delta], car)
         return 1e5 * rate[[1, 3]]
 
-<<<<<<< HEAD
-=======
     # Finer by two orders of magnitude than what is asserted, and still coarser than rounding.
->>>>>>> f1b9743aa6025b797c644ae6212c89c005fda922
     (_, scaled), _, status, message = fsolve(unsteady, [0.0, 1.0], xtol=1e-9, full_output=True)
     assert status == 1, message
     beyond_geometry = 1e-5 * scaled - car.wheelbase * curvature
