@@ -96,8 +96,8 @@ def plan_speed(
 ) -> Array:
     """Fastest jerk-limited speed profile (n,), m/s, on the grid of `curvature` (n,), 1/m.
 
-    An open path starts and ends at `limits.end_speed`; a closed one is planned over three laps, of
-    which the middle one is kept, so its ends meet.
+    An open path starts and ends at `limits.end_speed`; a closed one is planned over three laps, or
+    as many as reaching full speed takes, of which the middle one is kept, so its ends meet.
 
     Raises
     ------
@@ -105,11 +105,17 @@ def plan_speed(
         If the linear programme finds no profile (the message holds the solver's).
     """
     if closed:
-        laps = np.concatenate([curvature[:-1], curvature[:-1], curvature])
+        lap, n = spacing * (len(curvature) - 1), len(curvature) - 1
+        weakest = min(limits.max_acceleration, limits.deceleration)
+        run_up = limits.max_speed * (
+            0.5 * limits.max_speed / weakest + 2.0 * weakest / limits.max_jerk
+        )
+        before = max(int(np.ceil(run_up / lap)), 1)
         shares = np.broadcast_to(share, curvature.shape)
-        shares = np.concatenate([shares[:-1], shares[:-1], shares])
-        n = len(curvature) - 1
-        speed = plan_speed(laps, spacing, limits, share=shares)[n : 2 * n + 1].copy()
+        laps = np.append(np.tile(curvature[:-1], 2 * before + 1), curvature[-1])
+        shares = np.append(np.tile(shares[:-1], 2 * before + 1), shares[-1])
+        speed = plan_speed(laps, spacing, limits, share=shares)
+        speed = speed[before * n : (before + 1) * n + 1].copy()
         speed[-1] = speed[0]
         return speed
     caps = speed_caps(curvature, spacing, limits, share)
