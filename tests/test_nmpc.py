@@ -329,6 +329,22 @@ def test_ladder_of_fallbacks(nmpc: tuple[gymnasium.Env, Any], blind: bool) -> No
     assert seen == ["stanley"] * 4 + ["stop"] * 2
 
 
+def test_the_solve_after_a_failed_one_begins_cold(nmpc: tuple[gymnasium.Env, Any]) -> None:
+    env, agent = nmpc
+    observation, _ = env.reset(options={"arc_length": 35.0, "lateral_error": 0.1})
+    rows = [observation]
+    # Until the steering has left its limits: along them every plan begins alike.
+    for _ in range(20):
+        start = np.array([len(rows) == 1])
+        rows.append(env.step(agent.predict(rows[-1], episode_start=start)[0])[0])
+    warm, _ = agent.predict(rows[-1])
+    cold, _ = agent.predict(rows[-1], episode_start=np.array([True]))
+    assert not np.array_equal(warm, cold)
+    agent.predict(rows[-3], episode_start=np.array([True]))
+    agent.predict(np.where(np.arange(len(rows[-2])) == 5, np.nan, rows[-2]))
+    np.testing.assert_array_equal(agent.predict(rows[-1])[0], cold)
+
+
 def test_a_plan_that_is_used_up_is_followed_by_stanley() -> None:
     env = gymnasium.make(ID, trajectory="u-turn", preview_steps=3)
     for name in NAMES:
