@@ -1,50 +1,15 @@
 """The real-time NMPC as an agent of batches: memories, weights, and observations of every kind."""
 
-from collections import Counter
-from typing import Any
-
-import gymnasium
 import numpy as np
 import pytest
-from nmpc_situations import WEIGHTS
-from numpy.typing import NDArray
+from driven_vehicles import drives, environment, made
 
-import agents
-import lpv_track_env  # noqa: F401  registers the environments
 from agents.nmpc import rti
-from agents.nmpc.problem import Status
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import SCALARS
-from lpv_track_env.registration import PATH_TRACKING
-from lpv_track_env.vector_env import PathTrackingVectorEnv
-from lpv_track_env.vehicle import VEHICLES
 from trajectories import CurvatureBands
 
-Array = NDArray[Any]
-BEGIN, GOES_ON = np.array([True]), np.array([False])
-MAX_ITERATIONS = 40
-"""Of the interior-point method, after the tries of the active-set method that count as well."""
-
-
-def environment(**settings: Any) -> gymnasium.Env:
-    return gymnasium.make(PATH_TRACKING, **{"trajectory": "u-turn", **settings})
-
-
-def made(env: gymnasium.Env | None = None, **settings: Any) -> Any:
-    return agents.make("lpv-nmpc", environment() if env is None else env, **settings)
-
-
-def drives(n: int, steps: int) -> Array:
-    """Observations (steps, n, size) of vehicles that are driven from all over a path."""
-    envs = PathTrackingVectorEnv(
-        n, "T1", random_start=True, initial_error_range=(0.5, 0.1, 1.0), autoreset_mode="Disabled"
-    )
-    agent = agents.make("lpv-nmpc", envs.single)
-    seen = [envs.reset(seed=3)[0]]
-    for _ in range(steps - 1):
-        seen.append(envs.step(agent.predict(seen[-1])[0])[0])
-    return np.array(seen)
-
+BEGIN = np.array([True])
 
 # Batches and memories ------------------------------------------------------------------------
 
@@ -254,82 +219,3 @@ def test_horizon_shorter_than_the_preview() -> None:
     np.testing.assert_array_equal(
         made(horizon=7).predict(changed)[0], made(horizon=7).predict(rows)[0]
     )
-
-
-# Robustness ----------------------------------------------------------------------------------
-
-
-def wild_observations(rng: np.random.Generator, count: int, steps: int) -> Array:
-    """Speeds to 30 m/s, errors to 5 m and 1 rad, actuators and curvature beyond all bounds."""
-    rows = np.empty((count, 8 + 2 * steps))
-    scalars = [(0.0, 30.0), (-3.0, 3.0), (-1.5, 1.5), (-9.0, 6.0), (-0.8, 0.8), (-5.0, 5.0),
-               (-1.0, 1.0), (0.0, 30.0)]  # fmt: skip
-    for k, bounds in enumerate(scalars):
-        rows[:, k] = rng.uniform(*bounds, count)
-    # Half of the paths bend steadily, half jump about; a tenth are beyond any path.
-    curvature = rng.uniform(-0.5, 0.5, (count, 1)) * np.ones(steps)
-    jumping = rng.random(count) < 0.5
-    curvature[jumping] = rng.uniform(-0.5, 0.5, (int(jumping.sum()), steps))
-    curvature[rng.random(count) < 0.1] *= 10.0
-    rows[:, 8 : 8 + steps] = curvature
-    ramp = rng.uniform(-3.0, 3.0, (count, 1)) * 0.05 * np.arange(1, steps + 1)
-    rows[:, 8 + steps :] = np.clip(rows[:, 7:8] + ramp, 0.0, 30.0)
-    broken = np.flatnonzero(rng.random(count) < 0.05)
-    rows[broken, rng.integers(0, rows.shape[1], len(broken))] = rng.choice(
-        [np.nan, np.inf, -np.inf], len(broken)
-    )
-    return rows.astype(np.float32)
-
-
-@pytest.mark.parametrize("vehicle", VEHICLES)
-def test_wild_observations(vehicle: str) -> None:
-    """24,000 in all. What cannot be solved says so, and every action can be driven."""
-    env = environment(vehicle=vehicle)
-    agent, rng, n = made(env), np.random.default_rng(5), 3000
-    statuses: Counter[str] = Counter()
-    for _ in range(2):
-        rows = wild_observations(rng, n, agent.task.layout.preview_steps)
-        # Twice: without plans, and with plans that were made for something else.
-        for cold in (True, False):
-            rows = rows if cold else rows[rng.permutation(n)]
-            actions, memory = agent.predict(rows, None, np.full(n, cold))
-            assert np.isfinite(actions).all()
-            assert (actions >= env.action_space.low).all()  # type: ignore[attr-defined]
-            assert (actions <= env.action_space.high).all()  # type: ignore[attr-defined]
-            finite = np.isfinite(rows).all(axis=1)
-            for k in range(n):
-                told = agent.diagnostics(memory[k])
-                status = Status(told["status"])
-                assert (status is Status.NAN) == (not finite[k])
-                assert 0 <= told["iterations"] <= MAX_ITERATIONS
-                assert (told["fallback"] == "") == (status is Status.SUCCESS)
-                statuses[status.value] += 1
-    solvable = statuses.total() - statuses["NAN"]
-    assert statuses["NAN"] > 0.03 * statuses.total()
-    assert statuses["SUCCESS"] > 0.95 * solvable, statuses
-
-
-def test_nothing_of_a_wild_batch_stays_in_the_solver() -> None:
-    """The workspace is shared by all rows: what one left there must not touch the next."""
-    rng, rows = np.random.default_rng(6), drives(3, 1)[0]
-    agent = made()
-    wanted = agent.predict(rows)[0]
-    agent.predict(wild_observations(rng, 300, 20))
-    np.testing.assert_array_equal(agent.predict(rows, None, np.ones(3, dtype=bool))[0], wanted)
-    mixed = np.insert(wild_observations(rng, 3, 20), [0, 1, 2], rows, axis=0)
-    np.testing.assert_array_equal(agent.predict(mixed)[0][::2], wanted)
-
-
-def test_actions_on_the_way_to_bounds_lie_in_the_action_space() -> None:
-    """The bounds are float32's: rounding to it must not step over them."""
-    env = environment()
-    agent = made(env, weights=TrackingWeights.from_array(WEIGHTS * ([100.0] * 8 + [1e-3, 1e-3])))
-    observation, _ = env.reset(options={"lateral_error": 3.0})
-    rows = np.repeat(observation[None], 200, axis=0)
-    rng = np.random.default_rng(7)
-    rows[:, 3] = rng.choice([3.5, 3.4999998, 3.2, -6.0], 200)
-    rows[:, 4] = rng.choice([-np.pi / 6, np.pi / 6, -0.51], 200)
-    actions, _ = agent.predict(rows)
-    for action in actions:
-        assert env.action_space.contains(action)
-    assert np.isclose(np.abs(actions[:, 1]), np.pi / 6).any()

@@ -80,7 +80,7 @@ def test_transitions_are_those_of_dummy_vec_env() -> None:
 
 
 def test_infos_are_not_shared() -> None:
-    env = make(3)
+    env = make(3, initial_error_range=(0.0, 0.0, 0.0), time_limit=20.0)
     env.reset()
     infos = env.step(np.zeros((3, 2)))[3]
     infos[0]["mine"] = 1
@@ -89,7 +89,7 @@ def test_infos_are_not_shared() -> None:
 
 
 def test_time_limit_is_told_from_a_crash() -> None:
-    env = make(2, time_limit=0.05)
+    env = make(2, time_limit=0.05, initial_error_range=(0.0, 0.0, 0.0))
     env.reset()
     *_, done, infos = env.step(np.zeros((2, 2)))
     assert done.all()
