@@ -1,10 +1,9 @@
-"""Active-set steps for the NMPC's quadratic program, compiled.
+"""Guesses about which inequalities of the NMPC's quadratic program bind, compiled.
 
-Most programs need no inequality, or the ones that bound the last plan. So a guess is made from the
-shifted plan's gaps, the program is solved with these as equations, and the guess is mended: what is
-broken binds, what pulls is freed, a soft constraint whose multiplier exceeds its price is broken.
-The primal-dual active-set method (Hintermueller, Ito and Kunisch, SIAM J. Optim. 13, 2002) with an
-augmented Lagrangian for what binds. It may cycle: `interior_point` then takes over.
+A guess calls every inequality FREE, BINDING or BROKEN_SOFT. With it the program is one with
+equations, solved by an augmented Lagrangian; what that solution breaks or holds by a multiplier of
+the wrong sign mends the guess. Where the guess stands it is the solution, to rounding. Arrays are
+those of `layout`.
 """
 
 import math
@@ -12,8 +11,50 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from agents.nmpc.program import LINEAR, PAIRS, QUADRATIC, RATIO
-from trajectories.compilation import compiled
+from agents.nmpc.layout import (
+    BARRIER_A,
+    BARRIER_CROSS,
+    BARRIER_RATE,
+    BARRIER_VX,
+    BARRIER_VY,
+    CHANGE_A,
+    CHANGE_DELTA,
+    FIRST_CHANGE_A,
+    FIRST_CHANGE_DELTA,
+    FORCE,
+    GAP,
+    HIGH_A,
+    HIGH_RATE,
+    HIGH_SPEED,
+    LAM,
+    LINEAR,
+    LOW_A,
+    LOW_RATE,
+    LOW_SPEED,
+    MAX_DELTA,
+    MODE,
+    NOW_A,
+    NOW_DELTA,
+    NOW_R,
+    NOW_VX,
+    NOW_VY,
+    PAIRS,
+    PLAN_A,
+    PLAN_DELTA,
+    PLAN_R,
+    PLAN_VX,
+    PLAN_VY,
+    QUADRATIC,
+    RATIO,
+    SLOPE_A,
+    SLOPE_RATE,
+    SLOPE_VX,
+    SLOPE_VY,
+    WEIGHT,
+    T,
+)
+from agents.nmpc.linearisation import RATE, RATE_DELTA, RATE_R, RATE_VX, RATE_VY
+from trajectories.compilation import compiled_internal
 
 Array = NDArray[Any]
 Float = Any
@@ -25,83 +66,125 @@ NEAR = 1e-4
 HELD = 1e-9
 """Largest gap of a constraint that binds."""
 SLIGHT = 1e-9
-"""Multiplier below which a constraint that binds is freed."""
 STIFFNESS = 1e7
-"""Penalty of the augmented Lagrangian."""
 
 
-@compiled
-def guess(gaps: Array, mode: Array, lam: Array) -> None:
+@compiled_internal
+def measure_gaps(
+    stages: Array, lanes: Array, last_a: Float, last_delta: Float, constants: Array
+) -> None:
+    """Fill the gaps of linearised constraints; the rows of slacks are left alone."""
+    low_a, high_a, max_delta = constants[LOW_A], constants[HIGH_A], constants[MAX_DELTA]
+    ratio = constants[RATIO]
+    before_a, before_delta = last_a, last_delta
+    most_a, most_delta = constants[FIRST_CHANGE_A], constants[FIRST_CHANGE_DELTA]
+    gap = lanes[GAP : GAP + PAIRS]
+    for i in range(gap.shape[1]):
+        e, end = stages[i], stages[i + 1]
+        a, delta = e[NOW_A], e[NOW_DELTA]
+        gap[0, i], gap[1, i] = high_a - a, a - low_a
+        gap[2, i], gap[3, i] = max_delta - delta, delta + max_delta
+        change_a, change_delta = a - before_a, delta - before_delta
+        gap[4, i], gap[5, i] = most_a - change_a, change_a + most_a
+        gap[6, i], gap[7, i] = most_delta - change_delta, change_delta + most_delta
+        vx, vy = end[NOW_VX], end[NOW_VY]
+        gap[8, i], gap[9, i] = constants[HIGH_SPEED] - vx, vx - constants[LOW_SPEED]
+        rate = e[RATE] + e[RATE_VX] * (e[NOW_VX] - e[PLAN_VX])
+        rate += e[RATE_VY] * (e[NOW_VY] - e[PLAN_VY])
+        rate += e[RATE_R] * (e[NOW_R] - e[PLAN_R])
+        rate += a - e[PLAN_A] + e[RATE_DELTA] * (delta - e[PLAN_DELTA])
+        gap[11, i], gap[12, i] = constants[HIGH_RATE] - rate, rate - constants[LOW_RATE]
+        gap[14, i], gap[15, i] = ratio * vx - vy, ratio * vx + vy
+        before_a, before_delta = a, delta
+        most_a, most_delta = constants[CHANGE_A], constants[CHANGE_DELTA]
+
+
+@compiled_internal
+def is_slack(pair: int) -> bool:
+    """Whether a pair is a slack's own bound."""
+    return pair >= 8 and (pair - 8) % 3 == 2
+
+
+@compiled_internal
+def guess(lanes: Array) -> None:
     """Guess which constraints hold as equations, or are broken, from a plan's gaps."""
     for k in range(PAIRS):
-        row, into, multiplier = gaps[k], mode[k], lam[k]
-        soft = k >= 8
-        for i in range(gaps.shape[1]):
-            multiplier[i] = 0.0
-            into[i] = FREE
-            if row[i] < NEAR:
-                into[i] = BROKEN_SOFT if soft and row[i] < -NEAR else BINDING
-    for k in (10, 13, 16):
-        mode[k] = FREE
+        gap, mode, lam = lanes[GAP + k], lanes[MODE + k], lanes[LAM + k]
+        near = -math.inf if is_slack(k) else NEAR
+        broken = -NEAR if k >= 8 else -math.inf
+        for i in range(lanes.shape[1]):
+            lam[i] = 0.0
+            found = BINDING if gap[i] < near else FREE
+            mode[i] = BROKEN_SOFT if gap[i] < min(near, broken) else found
 
 
-@compiled
-def hold(
-    gaps: Array, mode: Array, lam: Array, limits: Array, weight: Array, base: Array,
-    barrier: Array, slope: Array,
-) -> None:  # fmt: skip
-    """Fill `barrier` and `slope` for an equality-constrained step.
+@compiled_internal
+def hold(lanes: Array, constants: Array) -> None:
+    """Fill barrier and slope for an equality-constrained step.
 
     Binding constraints by an augmented Lagrangian, broken soft ones by their price.
     """
-    n = gaps.shape[1]
     for k in range(PAIRS):
-        row, into, multiplier, wk, bk = gaps[k], mode[k], lam[k], weight[k], base[k]
+        gap, mode, lam = lanes[GAP + k], lanes[MODE + k], lanes[LAM + k]
+        weight, force = lanes[WEIGHT + k], lanes[FORCE + k]
         linear = quadratic = 0.0
         if k >= 8:
-            linear, quadratic = limits[LINEAR + (k - 8) // 3], limits[QUADRATIC + (k - 8) // 3]
-        for i in range(n):
-            wk[i] = STIFFNESS if into[i] == BINDING else 0.0
-            bk[i] = multiplier[i] - STIFFNESS * row[i] if into[i] == BINDING else 0.0
-            wk[i] = quadratic if into[i] == BROKEN_SOFT else wk[i]
-            bk[i] = linear - quadratic * row[i] if into[i] == BROKEN_SOFT else bk[i]
-    ratio = limits[RATIO]
-    for i in range(n):
+            kind = (k - 8) // 3
+            linear, quadratic = constants[LINEAR + kind], constants[QUADRATIC + kind]
+        for i in range(lanes.shape[1]):
+            held, pull = 0.0, 0.0
+            if mode[i] == BINDING:
+                held, pull = STIFFNESS, lam[i] - STIFFNESS * gap[i]
+            if mode[i] == BROKEN_SOFT:
+                held, pull = quadratic, linear - quadratic * gap[i]
+            weight[i], force[i] = held, pull
+    ratio = constants[RATIO]
+    w, b = lanes[WEIGHT : WEIGHT + PAIRS], lanes[FORCE : FORCE + PAIRS]
+    for i in range(lanes.shape[1]):
         for f in range(4):
-            slope[f, i] = base[2 * f, i] - base[2 * f + 1, i]
-            barrier[f, i] = weight[2 * f, i] + weight[2 * f + 1, i]
-        slope[4, i], barrier[4, i] = base[11, i] - base[12, i], weight[11, i] + weight[12, i]
-        right, left, both = base[14, i], base[15, i], weight[14, i] + weight[15, i]
-        slope[5, i] = base[8, i] - base[9, i] - ratio * (right + left)
-        slope[6, i] = right - left
-        barrier[5, i] = weight[8, i] + weight[9, i] + ratio * ratio * both
-        barrier[6, i] = ratio * (weight[15, i] - weight[14, i])
-        barrier[7, i] = both
+            lanes[SLOPE_A + f, i] = b[2 * f, i] - b[2 * f + 1, i]
+            lanes[BARRIER_A + f, i] = w[2 * f, i] + w[2 * f + 1, i]
+        lanes[SLOPE_RATE, i], lanes[BARRIER_RATE, i] = b[11, i] - b[12, i], w[11, i] + w[12, i]
+        right, left, both = b[14, i], b[15, i], w[14, i] + w[15, i]
+        lanes[SLOPE_VX, i] = b[8, i] - b[9, i] - ratio * (right + left)
+        lanes[SLOPE_VY, i] = right - left
+        lanes[BARRIER_VX, i] = w[8, i] + w[9, i] + ratio * ratio * both
+        lanes[BARRIER_CROSS, i] = ratio * (w[15, i] - w[14, i])
+        lanes[BARRIER_VY, i] = both
 
 
-@compiled
-def revise(gaps: Array, mode: Array, lam: Array, limits: Array) -> tuple[bool, Float]:
+@compiled_internal
+def revise(lanes: Array, constants: Array) -> tuple[bool, Float]:
     """Mend the guess after a step; whether it changed, and by how much what binds is missed."""
     changed, off = False, 0.0
     for k in range(PAIRS):
-        row, into, multiplier = gaps[k], mode[k], lam[k]
-        linear = limits[LINEAR + (k - 8) // 3] if k >= 8 else math.inf
-        if k in {10, 13, 16}:
+        if is_slack(k):
             continue
-        for i in range(gaps.shape[1]):
-            gap, was = row[i], into[i]
+        gaps, mode, lam = lanes[GAP + k], lanes[MODE + k], lanes[LAM + k]
+        linear = constants[LINEAR + (k - 8) // 3] if k >= 8 else math.inf
+        for i in range(lanes.shape[1]):
+            gap, was = gaps[i], mode[i]
             if was == FREE:
                 if gap < -HELD:
-                    into[i], multiplier[i], changed = BINDING, 0.0, True
+                    mode[i], lam[i], changed = BINDING, 0.0, True
             elif was == BINDING:
-                force = multiplier[i] - STIFFNESS * gap
+                force = lam[i] - STIFFNESS * gap
                 if force < -SLIGHT:
-                    into[i], multiplier[i], changed = FREE, 0.0, True
+                    mode[i], lam[i], changed = FREE, 0.0, True
                 elif force > linear:
-                    into[i], changed = BROKEN_SOFT, True
+                    mode[i], changed = BROKEN_SOFT, True
                 else:
-                    multiplier[i] = force
+                    lam[i] = force
                     off = max(off, abs(gap))
             elif gap > HELD:
-                into[i], multiplier[i], changed = BINDING, linear, True
+                mode[i], lam[i], changed = BINDING, linear, True
     return changed, off
+
+
+@compiled_internal
+def take_slacks(lanes: Array) -> None:
+    """Fill the slacks with what the gaps of the soft constraints leave them no choice but to be."""
+    for i in range(lanes.shape[1]):
+        for first in (8, 11, 14):
+            least = min(lanes[GAP + first, i], lanes[GAP + first + 1, i])
+            lanes[T + first + 2, i] = max(-least, 0.0)

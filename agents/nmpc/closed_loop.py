@@ -15,6 +15,8 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from agents.nmpc import rti
+from agents.nmpc.layout import working_space
+from agents.nmpc.program import INNER
 from agents.nmpc.rti_agent import RtiMemory, RtiNmpc
 from lpv_track_env import kernels as k
 from lpv_track_env.vector_env import PathTrackingVectorEnv
@@ -64,18 +66,16 @@ def drive_rows(
     first: int, last: int, periods: int, memories: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, bound: Array, weights: Array,
     constants: Array, plans: Array, flags: Array, told: Array, states: Array, actions: Array,
-    progress: Array, given: Array, tally: Array, trace: Array, work: Array,
+    progress: Array, given: Array, tally: Array, trace: Array, seen: Array, stages: Array,
+    lanes: Array,
 ) -> None:  # fmt: skip
     """Drive environments first to last - 1 until `progress` (n,) reaches `periods` or they end.
 
     One whose solve fails stays where it is; with `given` (n,) set it goes on with its row of
     `actions` in place of that solve. `trace` (n, periods or 0, MEMORY_SIZE) gets every memory.
+    `seen` (1, size), `stages` and `lanes` are working space.
     """
-    size = observations.shape[1]
-    seen = work[:size]
-    inner = work[size:]
     for row in range(first, last):
-        own = row if weights.shape[0] > 1 else 0
         memory, case = memories[row], cases[row]
         table = tables[rows[case, 0] : rows[case, 1]]
         period = env_constants[case, k.PERIOD]
@@ -84,14 +84,14 @@ def drive_rows(
             if given[row]:
                 given[row] = False
             else:
-                for j in range(size):
-                    seen[j] = observations[row, j]
-                code = rti.control_row(
-                    seen, weights[own], constants, plans[row], flags[row], told[row], states[row],
-                    actions[row], inner,
+                for j in range(seen.shape[1]):
+                    seen[0, j] = observations[row, j]
+                failed = rti.control(
+                    row, seen, weights, constants, plans, flags, told, states, actions, stages,
+                    lanes,
                 )  # fmt: skip
-                sums[ITERATIONS] += told[row, rti.INNER]
-                if code != rti.SUCCESS:
+                sums[ITERATIONS] += told[row, INNER]
+                if failed > 0:
                     sums[FAILED] += 1.0
                     break
             before_a, before_delta = memory[k.ACCELERATION], memory[k.STEERING]
@@ -122,14 +122,16 @@ def drive_in_threads(
     chunks: int, n: int, periods: int, memories: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, bound: Array, weights: Array,
     constants: Array, plans: Array, flags: Array, told: Array, states: Array, actions: Array,
-    progress: Array, given: Array, tally: Array, trace: Array, work: Array,
+    progress: Array, given: Array, tally: Array, trace: Array, seen: Array, stages: Array,
+    lanes: Array,
 ) -> None:  # fmt: skip
-    """`drive_rows` on all n, in chunks that threads share; `work` is (chunks, room)."""
+    """`drive_rows` on all n, in chunks that threads share; each has its own working space."""
     for chunk in numba.prange(chunks):
         drive_rows(
             chunk * n // chunks, (chunk + 1) * n // chunks, periods, memories, observations, ends,
             cases, env_constants, tables, rows, bound, weights, constants, plans, flags, told,
-            states, actions, progress, given, tally, trace, work[chunk],
+            states, actions, progress, given, tally, trace, seen[chunk], stages[chunk],
+            lanes[chunk],
         )  # fmt: skip
 
 
@@ -177,9 +179,10 @@ class ClosedLoop:
         self._threads = min(threads, n)
         if self._threads > 1:
             os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-        room = rti.room(agent.problem.horizon) + agent.task.layout.size
-        # Rows of whole cache lines, so that threads do not share one.
-        self._work = np.zeros((self._threads, -(-room // 8) * 8))
+        self._work = (
+            np.zeros((self._threads, 1, agent.task.layout.size)),
+            *working_space(agent.problem.horizon, self._threads),
+        )
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -238,7 +241,7 @@ class ClosedLoop:
         )  # fmt: skip
         while True:
             if self._threads == 1:
-                drive_rows(0, n, *arguments, self._work[0])
+                drive_rows(0, n, *arguments, *(space[0] for space in self._work))
             else:
                 self._in_threads(n, arguments)
             stuck = np.flatnonzero((arrays.ends == k.RUNNING) & (progress < periods))
@@ -251,7 +254,7 @@ class ClosedLoop:
         before = numba.get_num_threads()
         numba.set_num_threads(self._threads)
         try:
-            drive_in_threads(self._threads, n, *arguments, self._work)  # type: ignore[call-arg]
+            drive_in_threads(self._threads, n, *arguments, *self._work)  # type: ignore[call-arg]
         finally:
             numba.set_num_threads(before)
 

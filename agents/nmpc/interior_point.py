@@ -1,211 +1,219 @@
-"""Interior-point steps for the NMPC's quadratic program, compiled.
+"""Primal-dual interior-point method for the NMPC's quadratic program: its steps, compiled.
 
 Mehrotra's predictor and corrector on Riccati recursions (`riccati`), from an infeasible start.
-Every
-inequality is a pair (t, lam) with t lam -> 0; rows as in `program`::
-
-     0.. 7   high, low of a, delta, a - a_before, delta - delta_before        t = gap
-     8.. 9   high, low of vx at the period's end,         10  its slack       t = gap + slack
-    11..12   high, low of vx' at the period's start,      13  its slack
-    14..15   ratio vx - vy, ratio vx + vy at the end,     16  their slack     t = slack
-
 A slack s costs linear s + 1/2 quadratic s^2 and is eliminated by hand: with w = lam / t and b the
 multiplier that a step of no length would give, its step is
 
     ds = (sum b - linear - quadratic s - sum w dgap) / (quadratic + sum w)
 
 over its pairs and its own bound. What the Riccati recursion sees is then a Hessian and a gradient
-by stage.
+by stage. Pairs and arrays are those of `layout`.
 """
 
 from typing import Any
 
 from numpy.typing import NDArray
 
-from agents.nmpc.linearisation import RATE_DELTA, RATE_R, RATE_VX, RATE_VY
-from agents.nmpc.program import (
+from agents.nmpc.layout import (
+    BARRIER_A,
+    BARRIER_CROSS,
+    BARRIER_RATE,
+    BARRIER_VX,
+    BARRIER_VY,
+    BOTTOM,
+    BOTTOM_RATE,
+    BOTTOM_RATIO,
+    CHANGE_A,
+    CHANGE_DELTA,
+    DLAM,
+    DT,
+    FORCE,
+    GAP,
     HIGH_A,
+    INVERSE,
+    LAM,
     LINEAR,
+    LINEAR_RATE,
+    LINEAR_RATIO,
+    LONGEST,
     LOW_A,
     MAX_DELTA,
     PAIRS,
     QUADRATIC,
+    QUADRATIC_RATE,
+    QUADRATIC_RATIO,
     RATIO,
+    RESIDUAL,
+    SLOPE_A,
+    SLOPE_RATE,
+    SLOPE_VX,
+    SLOPE_VY,
     STEP_A,
     STEP_DELTA,
+    STEP_R,
+    STEP_VX,
+    STEP_VY,
+    TOP,
+    TOP_RATE,
+    TOP_RATIO,
+    WEIGHT,
+    T,
 )
-from lpv_track_env.bicycle import VX, VY, YAW_RATE
-from trajectories.compilation import compiled
+from agents.nmpc.linearisation import RATE_DELTA, RATE_R, RATE_VX, RATE_VY
+from trajectories.compilation import compiled_internal
 
 Array = NDArray[Any]
 Float = Any
 
-FUNCTIONALS = 8
-"""Rows of a step: a, delta, their changes, vx, vx', ratio vx - vy, ratio vx + vy."""
 START_BARRIER = 300.0
 """Product t lam at the start."""
 START_DISTANCE = 1.0
 """Least t at the start, as a share of the range between a pair's bounds."""
 
 
-@compiled
-def start(gaps: Array, limits: Array, t: Array, lam: Array, residual: Array) -> Float:
+@compiled_internal
+def start(lanes: Array, constants: Array) -> Float:
     """Start of all pairs: products at START_BARRIER, t at least some share of its range.
 
     Returns the largest residual t - gap.
     """
-    n, worst = gaps.shape[1], 0.0
-    for k in range(8):
-        kind = k // 2
-        if kind == 0:
-            reach = limits[HIGH_A] - limits[LOW_A]
-        elif kind == 1:
-            reach = 2.0 * limits[MAX_DELTA]
-        elif kind == 2:
-            reach = 2.0 * limits[STEP_A]
-        else:
-            reach = 2.0 * limits[STEP_DELTA]
-        for i in range(n):
-            t[k, i] = max(gaps[k, i], START_DISTANCE * reach)
-            residual[k, i] = t[k, i] - gaps[k, i]
-            worst = max(worst, residual[k, i])
-            lam[k, i] = START_BARRIER / t[k, i]
-    for soft in range(3):
-        first, second, own = 8 + 3 * soft, 9 + 3 * soft, 10 + 3 * soft
-        price = limits[LINEAR + soft] + 1e-3
-        for i in range(n):
-            least = START_BARRIER / price
-            slack = max(-min(gaps[first, i], gaps[second, i]), 0.0) + least
-            t[own, i] = slack
-            t[first, i] = gaps[first, i] + slack
-            t[second, i] = gaps[second, i] + slack
-            residual[first, i] = residual[second, i] = residual[own, i] = 0.0
-            lam[first, i] = START_BARRIER / t[first, i]
-            lam[second, i] = START_BARRIER / t[second, i]
-            lam[own, i] = START_BARRIER / slack
+    worst = 0.0
+    for i in range(lanes.shape[1]):
+        for k in range(8):
+            if k < 2:
+                reach = constants[HIGH_A] - constants[LOW_A]
+            elif k < 4:
+                reach = 2.0 * constants[MAX_DELTA]
+            else:
+                reach = 2.0 * constants[CHANGE_A if k < 6 else CHANGE_DELTA]
+            gap = lanes[GAP + k, i]
+            t = max(gap, START_DISTANCE * reach)
+            worst = max(worst, t - gap)
+            lanes[T + k, i], lanes[RESIDUAL + k, i] = t, t - gap
+            lanes[LAM + k, i] = START_BARRIER / t
+        for soft in range(3):
+            first = 8 + 3 * soft
+            high, low = lanes[GAP + first, i], lanes[GAP + first + 1, i]
+            least = START_BARRIER / (constants[LINEAR + soft] + 1e-3)
+            slack = max(-min(high, low), 0.0) + least
+            lanes[T + first, i], lanes[T + first + 1, i] = high + slack, low + slack
+            lanes[T + first + 2, i] = slack
+            for k in range(first, first + 3):
+                lanes[RESIDUAL + k, i] = 0.0
+                lanes[LAM + k, i] = START_BARRIER / lanes[T + k, i]
     return worst
 
 
-@compiled
-def condense(
-    t: Array, lam: Array, residual: Array, share: Float, centre: Float, corrections: Array,
-    predicting: bool, limits: Array, inverse: Array, weight: Array, base: Array,
-    eliminated: Array, barrier: Array, slope: Array,
-) -> None:  # fmt: skip
-    """Fill what the pairs add to the gradient (`slope`) and, if predicting, the Hessian.
+@compiled_internal
+def weigh(lanes: Array, constants: Array) -> None:
+    """Fill what the pairs add to the Hessian, and no corrections yet.
 
-    `base` (PAIRS, N) gets each pair's multiplier for a step of no length, `inverse` 1 / t,
-    `weight` lam / t, `eliminated` (6, N) the slacks' numerators and 1 / denominators.
+    w1 + w2 - (w1 - w2)^2 / (quadratic + sum w) and its like are taken without differences of large
+    numbers.
     """
-    n = t.shape[1]
+    n = lanes.shape[1]
     for k in range(PAIRS):
-        tk, lk, rk, ck = t[k], lam[k], residual[k], corrections[k]
-        ik, wk, bk = inverse[k], weight[k], base[k]
-        if predicting:
-            for i in range(n):
-                ik[i] = 1.0 / tk[i]
-                wk[i] = lk[i] * ik[i]
-                bk[i] = wk[i] * share * rk[i]
-        else:
-            for i in range(n):
-                bk[i] = (centre - ck[i]) * ik[i] + wk[i] * share * rk[i]
-    for f in range(4):
-        high, low, into = base[2 * f], base[2 * f + 1], slope[f]
+        t, lam, correction = lanes[T + k], lanes[LAM + k], lanes[DT + k]
+        inverse, weight = lanes[INVERSE + k], lanes[WEIGHT + k]
         for i in range(n):
-            into[i] = high[i] - low[i]
-        if predicting:
-            high, low, into = weight[2 * f], weight[2 * f + 1], barrier[f]
-            for i in range(n):
-                into[i] = high[i] + low[i]
-    for soft in range(3):
-        first, second, own = 8 + 3 * soft, 9 + 3 * soft, 10 + 3 * soft
-        linear, quadratic = limits[LINEAR + soft], limits[QUADRATIC + soft]
-        top, bottom = eliminated[2 * soft], eliminated[2 * soft + 1]
-        b1, b2, b3, slack = base[first], base[second], base[own], t[own]
-        w1, w2, w3 = weight[first], weight[second], weight[own]
-        for i in range(n):
-            top[i] = b1[i] + b2[i] + b3[i] - linear - quadratic * slack[i]
-        if predicting:
-            for i in range(n):
-                bottom[i] = 1.0 / (quadratic + w1[i] + w2[i] + w3[i])
-        # w1 + w2 - (w1 - w2)^2 / (quadratic + sum w) and its like, without differences of large
-        # numbers.
-        if soft < 2:
-            into, row = slope[5 - soft], barrier[5 - soft]
-            for i in range(n):
-                into[i] = b1[i] - b2[i] - (w1[i] - w2[i]) * top[i] * bottom[i]
-            if predicting:
-                for i in range(n):
-                    apart = quadratic + w3[i]
-                    row[i] = ((w1[i] + w2[i]) * apart + 4.0 * w1[i] * w2[i]) * bottom[i]
-        else:
-            ratio, by_vx, by_vy = limits[RATIO], slope[5], slope[6]
-            for i in range(n):
-                taken = top[i] * bottom[i]
-                right, left = b1[i] - w1[i] * taken, b2[i] - w2[i] * taken
-                by_vx[i] -= ratio * (right + left)
-                by_vy[i] = right - left
-            if predicting:
-                for i in range(n):
-                    apart = (quadratic + w3[i]) * bottom[i]
-                    barrier[5, i] += ratio * ratio * (w1[i] + w2[i]) * apart
-                    barrier[6, i] = ratio * (w2[i] - w1[i]) * apart
-                    barrier[7, i] = (w1[i] + w2[i]) * apart + 4.0 * w1[i] * w2[i] * bottom[i]
+            inverse[i] = 1.0 / t[i]
+            weight[i] = lam[i] * inverse[i]
+            correction[i] = 0.0
+    ratio = constants[RATIO]
+    w = lanes[WEIGHT : WEIGHT + PAIRS]
+    for i in range(n):
+        for f in range(4):
+            lanes[BARRIER_A + f, i] = w[2 * f, i] + w[2 * f + 1, i]
+        w1, w2, w3, quadratic = w[8, i], w[9, i], w[10, i], constants[QUADRATIC]
+        bottom = 1.0 / (quadratic + w1 + w2 + w3)
+        vx = ((w1 + w2) * (quadratic + w3) + 4.0 * w1 * w2) * bottom
+        lanes[BOTTOM, i] = bottom
+        w1, w2, w3, quadratic = w[11, i], w[12, i], w[13, i], constants[QUADRATIC_RATE]
+        bottom = 1.0 / (quadratic + w1 + w2 + w3)
+        lanes[BARRIER_RATE, i] = ((w1 + w2) * (quadratic + w3) + 4.0 * w1 * w2) * bottom
+        lanes[BOTTOM_RATE, i] = bottom
+        w1, w2, w3, quadratic = w[14, i], w[15, i], w[16, i], constants[QUADRATIC_RATIO]
+        bottom = 1.0 / (quadratic + w1 + w2 + w3)
+        apart = (quadratic + w3) * bottom
+        lanes[BARRIER_VX, i] = vx + ratio * ratio * (w1 + w2) * apart
+        lanes[BARRIER_CROSS, i] = ratio * (w2 - w1) * apart
+        lanes[BARRIER_VY, i] = (w1 + w2) * apart + 4.0 * w1 * w2 * bottom
+        lanes[BOTTOM_RATIO, i] = bottom
 
 
-@compiled
-def expand(
-    records: Array, dx: Array, du: Array, t: Array, lam: Array, residual: Array, share: Float,
-    limits: Array, inverse: Array, weight: Array, base: Array, eliminated: Array,
-    functionals: Array, dt: Array, dlam: Array, longest: Array,
-) -> Float:  # fmt: skip
+@compiled_internal
+def press(lanes: Array, constants: Array, share: Float) -> None:
+    """Fill what the pairs, and their corrections in the rows of dt, add to the gradient."""
+    n = lanes.shape[1]
+    for k in range(PAIRS):
+        force, correction = lanes[FORCE + k], lanes[DT + k]
+        weight, residual = lanes[WEIGHT + k], lanes[RESIDUAL + k]
+        for i in range(n):
+            force[i] = correction[i] + weight[i] * share * residual[i]
+    ratio = constants[RATIO]
+    w, b = lanes[WEIGHT : WEIGHT + PAIRS], lanes[FORCE : FORCE + PAIRS]
+    for i in range(n):
+        for f in range(4):
+            lanes[SLOPE_A + f, i] = b[2 * f, i] - b[2 * f + 1, i]
+        b1, b2, slack = b[8, i], b[9, i], lanes[T + 10, i]
+        top = b1 + b2 + b[10, i] - constants[LINEAR] - constants[QUADRATIC] * slack
+        vx = b1 - b2 - (w[8, i] - w[9, i]) * top * lanes[BOTTOM, i]
+        lanes[TOP, i] = top
+        b1, b2, slack = b[11, i], b[12, i], lanes[T + 13, i]
+        top = b1 + b2 + b[13, i] - constants[LINEAR_RATE] - constants[QUADRATIC_RATE] * slack
+        lanes[SLOPE_RATE, i] = b1 - b2 - (w[11, i] - w[12, i]) * top * lanes[BOTTOM_RATE, i]
+        lanes[TOP_RATE, i] = top
+        b1, b2, slack = b[14, i], b[15, i], lanes[T + 16, i]
+        top = b1 + b2 + b[16, i] - constants[LINEAR_RATIO] - constants[QUADRATIC_RATIO] * slack
+        taken = top * lanes[BOTTOM_RATIO, i]
+        right, left = b1 - w[14, i] * taken, b2 - w[15, i] * taken
+        lanes[SLOPE_VX, i], lanes[SLOPE_VY, i] = vx - ratio * (right + left), right - left
+        lanes[TOP_RATIO, i] = top
+
+
+@compiled_internal
+def expand(stages: Array, lanes: Array, constants: Array, share: Float) -> Float:
     """Steps of all pairs from the Riccati step; returns the step length that keeps them positive.
 
-    The length is at most 1 and goes all the way to the nearest bound. `longest` (N,) is scratch.
+    The length is at most 1 and goes all the way to the nearest bound.
     """
-    n = t.shape[1]
-    ratio = limits[RATIO]
+    n = lanes.shape[1]
+    ratio = constants[RATIO]
     before_a = before_delta = 0.0
+    dt, rest, w = (
+        lanes[DT : DT + PAIRS],
+        lanes[RESIDUAL : RESIDUAL + 8],
+        lanes[WEIGHT : WEIGHT + PAIRS],
+    )
+    longest = lanes[LONGEST]
     for i in range(n):
-        a, delta, e = du[i, 0], du[i, 1], records[i]
-        functionals[0, i], functionals[1, i] = a, delta
-        functionals[2, i], functionals[3, i] = a - before_a, delta - before_delta
+        e, end = stages[i], stages[i + 1]
+        a, delta, vx, vy = e[STEP_A], e[STEP_DELTA], end[STEP_VX], end[STEP_VY]
+        change_a, change_delta = a - before_a, delta - before_delta
         before_a, before_delta = a, delta
-        vx, vy = dx[i + 1, VX], dx[i + 1, VY]
-        functionals[4, i] = vx
-        rate = e[RATE_VX] * dx[i, VX] + e[RATE_VY] * dx[i, VY] + e[RATE_R] * dx[i, YAW_RATE]
-        functionals[5, i] = rate + a + e[RATE_DELTA] * delta
-        functionals[6, i], functionals[7, i] = ratio * vx - vy, ratio * vx + vy
+        dt[0, i], dt[1, i] = -a - share * rest[0, i], a - share * rest[1, i]
+        dt[2, i], dt[3, i] = -delta - share * rest[2, i], delta - share * rest[3, i]
+        dt[4, i], dt[5, i] = -change_a - share * rest[4, i], change_a - share * rest[5, i]
+        dt[6, i] = -change_delta - share * rest[6, i]
+        dt[7, i] = change_delta - share * rest[7, i]
+        slack = (lanes[TOP, i] + (w[8, i] - w[9, i]) * vx) * lanes[BOTTOM, i]
+        dt[8, i], dt[9, i], dt[10, i] = slack - vx, slack + vx, slack
+        rate = e[RATE_VX] * e[STEP_VX] + e[RATE_VY] * e[STEP_VY] + e[RATE_R] * e[STEP_R]
+        rate = rate + a + e[RATE_DELTA] * delta
+        slack = (lanes[TOP_RATE, i] + (w[11, i] - w[12, i]) * rate) * lanes[BOTTOM_RATE, i]
+        dt[11, i], dt[12, i], dt[13, i] = slack - rate, slack + rate, slack
+        right, left = ratio * vx - vy, ratio * vx + vy
+        slack = lanes[TOP_RATIO, i] - w[14, i] * right - w[15, i] * left
+        slack *= lanes[BOTTOM_RATIO, i]
+        dt[14, i], dt[15, i], dt[16, i] = slack + right, slack + left, slack
         longest[i] = 1e-9
-    for f in range(4):
-        high, low, z = 2 * f, 2 * f + 1, functionals[f]
-        for i in range(n):
-            dt[high, i] = -z[i] - share * residual[high, i]
-            dt[low, i] = z[i] - share * residual[low, i]
-    for soft in range(3):
-        first, second, own = 8 + 3 * soft, 9 + 3 * soft, 10 + 3 * soft
-        top, bottom = eliminated[2 * soft], eliminated[2 * soft + 1]
-        if soft < 2:
-            z = functionals[4 + soft]
-            for i in range(n):
-                w1 = weight[first, i]
-                w2 = weight[second, i]
-                ds = (top[i] + (w1 - w2) * z[i]) * bottom[i]
-                dt[own, i], dt[first, i], dt[second, i] = ds, ds - z[i], ds + z[i]
-        else:
-            right, left = functionals[6], functionals[7]
-            for i in range(n):
-                w1 = weight[first, i]
-                w2 = weight[second, i]
-                ds = (top[i] - w1 * right[i] - w2 * left[i]) * bottom[i]
-                dt[own, i], dt[first, i], dt[second, i] = ds, ds + right[i], ds + left[i]
     for k in range(PAIRS):
-        lk, dtk, dlk, ik = lam[k], dt[k], dlam[k], inverse[k]
-        wk, bk, rk = weight[k], base[k], residual[k]
+        lam, step, dlam, inverse = lanes[LAM + k], dt[k], lanes[DLAM + k], lanes[INVERSE + k]
+        weight, force, residual = w[k], lanes[FORCE + k], lanes[RESIDUAL + k]
         for i in range(n):
-            # base holds w share residual, which dt has taken off again.
-            dlk[i] = bk[i] - wk[i] * (dtk[i] + share * rk[i]) - lk[i]
-            worst = max(-dtk[i] * ik[i], -dlk[i] / lk[i])
+            # force holds w share residual, which dt has taken off again.
+            dlam[i] = force[i] - weight[i] * (step[i] + share * residual[i]) - lam[i]
+            worst = max(-step[i] * inverse[i], -dlam[i] / lam[i])
             longest[i] = max(longest[i], worst)
     worst = 1e-9
     for i in range(n):
@@ -213,35 +221,43 @@ def expand(
     return 1.0 / worst
 
 
-@compiled
-def update(t: Array, lam: Array, dt: Array, dlam: Array, length: Float, product: Array) -> Float:
-    """Take a step of all pairs; returns the mean product t lam. `product` (N,) is scratch."""
-    product[:] = 0.0
+@compiled_internal
+def centre(lanes: Array, length: Float, mu: Float) -> None:
+    """Turn the predictor's steps into corrections, in the rows of dt.
+
+    (target - dt dlam) / t, with Mehrotra's target for the products and the second-order correction.
+    """
+    reached, n = lanes[LONGEST], lanes.shape[1]
+    for i in range(n):
+        reached[i] = 0.0
     for k in range(PAIRS):
-        tk, lk, dtk, dlk = t[k], lam[k], dt[k], dlam[k]
-        for i in range(t.shape[1]):
-            tk[i] += length * dtk[i]
-            lk[i] += length * dlk[i]
-            product[i] += tk[i] * lk[i]
-    return _sum(product) / (PAIRS * t.shape[1])
+        t, lam, dt, dlam = lanes[T + k], lanes[LAM + k], lanes[DT + k], lanes[DLAM + k]
+        for i in range(n):
+            reached[i] += (t[i] + length * dt[i]) * (lam[i] + length * dlam[i])
+    share = _sum(reached) / (mu * PAIRS * n)
+    target = share * share * share * mu
+    for k in range(PAIRS):
+        dt, dlam, inverse = lanes[DT + k], lanes[DLAM + k], lanes[INVERSE + k]
+        for i in range(n):
+            dt[i] = (target - dt[i] * dlam[i]) * inverse[i]
 
 
-@compiled
-def centre_of(
-    t: Array, lam: Array, dt: Array, dlam: Array, length: Float, mu: Float, reached: Array,
-) -> Float:  # fmt: skip
-    """Mehrotra's target for the products; turns `dt` into the second-order corrections dt dlam."""
-    reached[:] = 0.0
-    for k in range(t.shape[0]):
-        tk, lk, dtk, dlk = t[k], lam[k], dt[k], dlam[k]
-        for i in range(t.shape[1]):
-            reached[i] += (tk[i] + length * dtk[i]) * (lk[i] + length * dlk[i])
-            dtk[i] *= dlk[i]
-    share = _sum(reached) / (mu * t.shape[0] * t.shape[1])
-    return share * share * share * mu
+@compiled_internal
+def update(lanes: Array, length: Float) -> Float:
+    """Take a step of all pairs; returns the mean product t lam."""
+    product, n = lanes[LONGEST], lanes.shape[1]
+    for i in range(n):
+        product[i] = 0.0
+    for k in range(PAIRS):
+        t, lam, dt, dlam = lanes[T + k], lanes[LAM + k], lanes[DT + k], lanes[DLAM + k]
+        for i in range(n):
+            t[i] += length * dt[i]
+            lam[i] += length * dlam[i]
+            product[i] += t[i] * lam[i]
+    return _sum(product) / (PAIRS * n)
 
 
-@compiled
+@compiled_internal
 def _sum(values: Array) -> Float:
     total = 0.0
     for i in range(values.shape[0]):

@@ -1,11 +1,8 @@
-"""The NMPC's quadratic program: its numbers, its constraints' gaps, its linear model, compiled.
+"""The NMPC's quadratic program, compiled: guesses first, the interior-point method if they fail.
 
-A gap is the distance to a bound, negative where it is broken. Rows of an array of gaps, per stage::
-
-     0.. 7   high, low of a, delta, a - a_before, delta - delta_before
-     8.. 9   high, low of vx at the period's end          (10 is its slack's row)
-    11..12   high, low of vx' at the period's start       (13)
-    14..15   ratio vx - vy, ratio vx + vy at the end      (16)
+The program is the problem linearised along a plan. The plan without inequalities is tried first,
+then a few guesses about which bind (`active_set`); most programs end there, exact to rounding. The
+others go on with `interior_point`. Arrays are those of `layout`.
 """
 
 import math
@@ -13,94 +10,170 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from agents.nmpc.linearisation import RATE, RATE_DELTA, RATE_R, RATE_VX, RATE_VY
-from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
-from trajectories.compilation import compiled
+from agents.nmpc import riccati
+from agents.nmpc.active_set import HELD, guess, hold, measure_gaps, revise, take_slacks
+from agents.nmpc.interior_point import START_BARRIER, centre, expand, press, start, update, weigh
+from agents.nmpc.layout import (
+    CHANGE_A,
+    CHANGE_DELTA,
+    FIRST_CHANGE_A,
+    FIRST_CHANGE_DELTA,
+    HIGH_A,
+    LOW_A,
+    MAX_DELTA,
+    NOW_A,
+    NOW_DELTA,
+    NOW_PSI,
+    NOW_R,
+    NOW_VX,
+    NOW_VY,
+    NOW_X,
+    NOW_Y,
+    PLAN_A,
+    PLAN_DELTA,
+    PLAN_PSI,
+    PLAN_R,
+    PLAN_VX,
+    PLAN_VY,
+    PLAN_X,
+    PLAN_Y,
+    POINT,
+    STEP_A,
+    STEP_DELTA,
+    STEP_X,
+    TOLERANCE,
+)
+from agents.nmpc.linearisation import HEADING_X, HEADING_Y, differentiate
+from trajectories.compilation import compiled_in_place, compiled_internal
 
 Array = NDArray[Any]
 Float = Any
 
-PAIRS = 17
+UNDECIDED, SUCCESS, MAXITER, NOT_FINITE, QP_FAILURE = range(-1, 4)
+"""Codes of a solve, but for the first by `problem.Status`: SUCCESS, MAXITER, NAN, QP_FAILURE."""
 
-# Numbers of the problem, (LIMITS_SIZE,): see `rti_solver.limits`.
-(
-    LOW_A, HIGH_A, MAX_DELTA, STEP_A, STEP_DELTA, FIRST_STEP_A, FIRST_STEP_DELTA, LOW_SPEED,
-    HIGH_SPEED, LOW_RATE, HIGH_RATE, RATIO, LINEAR, QUADRATIC, DAMPING_A, DAMPING_DELTA,
-) = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 15, 18, 19)  # fmt: skip
-LIMITS_SIZE = 20
-SLACK_OF = (0, 2, 1)
-"""Index in the problem's penalties (vx, vy, vx') of the soft constraints in their order here."""
+# What is told of a solve, (TOLD,): code, iterations in programs, programs, cost, largest slacks.
+CODE, INNER, OUTER, COST, SLACK = 0, 1, 2, 3, 4
+TOLD = 7
 
-
-@compiled
-def measure_gaps(
-    records: Array, base: Array, plan: Array, states: Array, inputs: Array, last: Array,
-    limits: Array, gaps: Array,
-) -> Float:  # fmt: skip
-    """Fill the gaps (PAIRS, N) of linearised constraints; the rows of slacks are left alone.
-
-    `base` (N + 1, 6) and `plan` (N, 2) are what the records were made along. Returns the least gap.
-    """
-    n = inputs.shape[0]
-    low_a, high_a, max_delta = limits[LOW_A], limits[HIGH_A], limits[MAX_DELTA]
-    ratio, least = limits[RATIO], math.inf
-    before_a, before_delta = last[0], last[1]
-    step_a, step_delta = limits[FIRST_STEP_A], limits[FIRST_STEP_DELTA]
-    for i in range(n):
-        a, delta, e = inputs[i, 0], inputs[i, 1], records[i]
-        gaps[0, i], gaps[1, i] = high_a - a, a - low_a
-        gaps[2, i], gaps[3, i] = max_delta - delta, delta + max_delta
-        change_a, change_delta = a - before_a, delta - before_delta
-        gaps[4, i], gaps[5, i] = step_a - change_a, change_a + step_a
-        gaps[6, i], gaps[7, i] = step_delta - change_delta, change_delta + step_delta
-        vx, vy = states[i + 1, VX], states[i + 1, VY]
-        gaps[8, i], gaps[9, i] = limits[HIGH_SPEED] - vx, vx - limits[LOW_SPEED]
-        rate = e[RATE] + e[RATE_VX] * (states[i, VX] - base[i, VX])
-        rate += e[RATE_VY] * (states[i, VY] - base[i, VY])
-        rate += e[RATE_R] * (states[i, YAW_RATE] - base[i, YAW_RATE])
-        rate += a - plan[i, 0] + e[RATE_DELTA] * (delta - plan[i, 1])
-        gaps[11, i], gaps[12, i] = limits[HIGH_RATE] - rate, rate - limits[LOW_RATE]
-        gaps[14, i], gaps[15, i] = ratio * vx - vy, ratio * vx + vy
-        before_a, before_delta = a, delta
-        step_a, step_delta = limits[STEP_A], limits[STEP_DELTA]
-        for k in range(8):
-            least = min(least, gaps[k, i])
-        for k in (8, 9, 11, 12, 14, 15):
-            least = min(least, gaps[k, i])
-    return least
+GUESSING, PREDICTING, CORRECTING = 0, 1, 2
+"""Phases: guesses, then predictor and corrector in turns."""
+MAX_GUESSES = 6
+MAX_ITERATIONS = 40
+CAUTION, LEAST_CAUTION = 0.995, 0.9999
+"""Share of the way to the nearest bound, at first and near the solution."""
+ACCEPTABLE = 1e-6
+"""Mean product at which rounding may end the iterations."""
 
 
-@compiled
-def clamp(inputs: Array, last: Array, limits: Array) -> None:
-    """Bring inputs (N, 2) within their bounds and rates, from the first on."""
-    before_a, before_delta = last[0], last[1]
-    step_a, step_delta = limits[FIRST_STEP_A], limits[FIRST_STEP_DELTA]
-    for i in range(inputs.shape[0]):
-        a = min(max(inputs[i, 0], before_a - step_a), before_a + step_a)
-        delta = min(max(inputs[i, 1], before_delta - step_delta), before_delta + step_delta)
-        before_a = min(max(a, limits[LOW_A]), limits[HIGH_A])
-        before_delta = min(max(delta, -limits[MAX_DELTA]), limits[MAX_DELTA])
-        inputs[i, 0], inputs[i, 1] = before_a, before_delta
-        step_a, step_delta = limits[STEP_A], limits[STEP_DELTA]
+@compiled_internal
+def clamp(stages: Array, at: int, last_a: Float, last_delta: Float, constants: Array) -> None:
+    """Bring the inputs of a point (from column `at` on) within bounds and rates, first to last."""
+    before_a, before_delta = last_a, last_delta
+    most_a, most_delta = constants[FIRST_CHANGE_A], constants[FIRST_CHANGE_DELTA]
+    for i in range(stages.shape[0] - 1):
+        e = stages[i]
+        a = min(max(e[at], before_a - most_a), before_a + most_a)
+        delta = min(max(e[at + 1], before_delta - most_delta), before_delta + most_delta)
+        before_a = min(max(a, constants[LOW_A]), constants[HIGH_A])
+        before_delta = min(max(delta, -constants[MAX_DELTA]), constants[MAX_DELTA])
+        e[at], e[at + 1] = before_a, before_delta
+        most_a, most_delta = constants[CHANGE_A], constants[CHANGE_DELTA]
 
 
-@compiled
-def follow(records: Array, base: Array, plan: Array, inputs: Array, states: Array) -> None:
-    """Fill states (N + 1, 6) by the linearised model under inputs (N, 2)."""
-    for k in range(6):
-        states[0, k] = base[0, k]
-    for i in range(inputs.shape[0]):
-        e = records[i]
-        d0 = states[i, VX] - base[i, VX]
-        d1 = states[i, VY] - base[i, VY]
-        d2 = states[i, PSI] - base[i, PSI]
-        d3 = states[i, YAW_RATE] - base[i, YAW_RATE]
-        ua, ud = inputs[i, 0] - plan[i, 0], inputs[i, 1] - plan[i, 1]
-        following, there = states[i + 1], base[i + 1]
+@compiled_internal
+def follow(stages: Array) -> None:
+    """Fill the states of the solution so far by the linearised model under its inputs."""
+    for k in range(2, POINT):
+        stages[0, NOW_A + k] = stages[0, PLAN_A + k]
+    for i in range(stages.shape[0] - 1):
+        e, f = stages[i], stages[i + 1]
+        da, ddelta = e[NOW_A] - e[PLAN_A], e[NOW_DELTA] - e[PLAN_DELTA]
+        dvx, dvy = e[NOW_VX] - e[PLAN_VX], e[NOW_VY] - e[PLAN_VY]
+        turn, dr = e[NOW_PSI] - e[PLAN_PSI], e[NOW_R] - e[PLAN_R]
         for k in range(6):
-            following[k] = there[k] + (
-                e[k] * d0 + e[6 + k] * d1 + e[12 + k] * d3 + e[20 + k] * ua + e[26 + k] * ud
-            )
-        following[PSI] += d2
-        following[X] += e[18] * d2 + (states[i, X] - base[i, X])
-        following[Y] += e[19] * d2 + (states[i, Y] - base[i, Y])
+            f[NOW_VX + k] = f[PLAN_VX + k] + riccati.moved(e, k, dvx, dvy, dr, da, ddelta)
+        f[NOW_PSI] += turn
+        f[NOW_X] += e[HEADING_X] * turn + (e[NOW_X] - e[PLAN_X])
+        f[NOW_Y] += e[HEADING_Y] * turn + (e[NOW_Y] - e[PLAN_Y])
+
+
+@compiled_in_place
+def solve_program(
+    stages: Array, lanes: Array, last_a: Float, last_delta: Float, weights: Array,
+    constants: Array, told: Array,
+) -> int:  # fmt: skip
+    """Linearise along the plan of `stages`, rolled out from its first state; solve the program.
+
+    (last_a, last_delta) is the input in force, `weights` (10,) are Q, S, R. The solution is the
+    stages' NOW and, in the lanes, the slacks. Returns a code; adds to `told` (TOLD,).
+    """
+    n = lanes.shape[1]
+    for i in range(n):
+        differentiate(stages[i], constants, stages[i + 1])
+    for i in range(n + 1):
+        for k in range(POINT):
+            stages[i, NOW_A + k] = stages[i, PLAN_A + k]
+    measure_gaps(stages, lanes, last_a, last_delta, constants)
+    guess(lanes)
+    mu, worst, share, tolerance = START_BARRIER, 0.0, 1.0, constants[TOLERANCE]
+    phase, tries, iterations, code, changed = GUESSING, 0, 0, UNDECIDED, True
+    # All methods take turns through one loop: each part is called from one place only, which
+    # halves the time that compiling takes.
+    while code == UNDECIDED:
+        if phase == GUESSING:
+            hold(lanes, constants)
+        else:
+            if phase == PREDICTING:
+                weigh(lanes, constants)
+            press(lanes, constants, share)
+        if phase == PREDICTING or (phase == GUESSING and changed):
+            riccati.factor(stages, lanes, weights, constants)
+        riccati.solve(stages, lanes, weights, constants)
+        length = 1.0
+        if phase != GUESSING:
+            length = expand(stages, lanes, constants, share)
+        if phase == PREDICTING:
+            centre(lanes, min(1.0, length), mu)
+            phase = CORRECTING
+            continue
+        total = 0.0
+        for i in range(n):
+            total += stages[i, STEP_A] + stages[i, STEP_DELTA] + stages[i + 1, STEP_X]
+        if not math.isfinite(total):
+            good = phase == CORRECTING and mu <= ACCEPTABLE and share * worst <= ACCEPTABLE
+            code = SUCCESS if good else QP_FAILURE
+            break
+        if phase == CORRECTING:
+            length = min(1.0, max(CAUTION, min(1.0 - mu, LEAST_CAUTION)) * length)
+            mu = update(lanes, length)
+            share *= 1.0 - length
+        for i in range(n + 1):
+            for k in range(POINT):
+                stages[i, NOW_A + k] += length * stages[i, STEP_A + k]
+        iterations += 1
+        if phase == CORRECTING:
+            phase = PREDICTING
+            if mu <= tolerance and share * worst <= tolerance:
+                code = SUCCESS
+            elif iterations >= MAX_ITERATIONS:
+                good = mu <= ACCEPTABLE and share * worst <= ACCEPTABLE
+                code = SUCCESS if good else MAXITER
+            continue
+        tries += 1
+        measure_gaps(stages, lanes, last_a, last_delta, constants)
+        changed, off = revise(lanes, constants)
+        if not changed and off <= HELD:
+            take_slacks(lanes)
+            code = SUCCESS
+        elif tries == MAX_GUESSES:
+            # Start the interior-point method where all inputs keep their limits.
+            clamp(stages, NOW_A, last_a, last_delta, constants)
+            follow(stages)
+            measure_gaps(stages, lanes, last_a, last_delta, constants)
+            worst = start(lanes, constants)
+            phase = PREDICTING
+    clamp(stages, NOW_A, last_a, last_delta, constants)
+    told[INNER] += iterations
+    told[OUTER] += 1.0
+    return code

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Action, DrivingTask
-from agents.nmpc import program, rti
+from agents.nmpc import layout, program, rti
 from agents.nmpc.base import Ladder, NmpcAgent
 from agents.nmpc.problem import INPUTS, STATES
 from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
@@ -29,7 +29,7 @@ class RtiMemory:
     def __init__(self, rows: int, horizon: int) -> None:
         self.plans = np.zeros((rows, horizon, INPUTS))
         self.flags = np.zeros((rows, rti.FLAGS), dtype=np.int64)
-        self.told = np.zeros((rows, rti.TOLD))
+        self.told = np.zeros((rows, program.TOLD))
         self.states = np.zeros((rows, horizon + 1, STATES))
         self.actions = np.zeros((rows, INPUTS))
         self.bands: list[int | None] = [None] * rows
@@ -120,8 +120,10 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             max_failures=max_failures,
         )
         self.solver = RtiSolver(self.problem, damping=damping, tolerance=tolerance)
-        self.solver.constants[rti.SPACE_LOW : rti.SPACE_LOW + 4] = [*self._low, *self._high]
-        self._work = np.zeros(rti.room(self.problem.horizon))
+        space = slice(layout.SPACE_LOW_A, layout.SPACE_HIGH_DELTA + 1)
+        self.solver.constants[space] = [*self._low, *self._high]
+        stages, lanes = layout.working_space(self.problem.horizon, 1)
+        self._stages, self._lanes = stages[0], lanes[0]
         self._memory: RtiMemory | None = None
         self._size = task.layout.size
 
@@ -182,13 +184,13 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         weights = self._rows if self._schedule is None else self._weights_of(rows, memory)
         began = time.perf_counter()
         failed = rti.control(
-            rows, weights, self.solver.constants, memory.plans, memory.flags, memory.told,
-            memory.states, memory.actions, self._work,
+            0, rows, weights, self.solver.constants, memory.plans, memory.flags, memory.told,
+            memory.states, memory.actions, self._stages, self._lanes,
         )  # fmt: skip
         memory.seconds = time.perf_counter() - began
         if memory.ladders or failed:
             self.replace_failed(
-                rows, memory, np.flatnonzero(memory.told[:, rti.CODE] != rti.SUCCESS)
+                rows, memory, np.flatnonzero(memory.told[:, program.CODE] != program.SUCCESS)
             )
         actions = memory.actions.astype(np.float32)
         return (actions[0] if single else actions), memory
@@ -226,7 +228,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             action = self.replace(
                 self.task.layout.unpack(rows[row]),
                 ladder,
-                STATUS[int(memory.told[row, rti.CODE])].value,
+                STATUS[int(memory.told[row, program.CODE])].value,
                 memory.plans[row] if planned else None,
                 age,
                 failures,
@@ -243,16 +245,16 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         """
         batch, row = memory.memory, memory.row
         told = batch.told[row]
-        status = STATUS[int(told[rti.CODE])]
-        solved = int(told[rti.CODE]) == rti.SUCCESS
-        order = np.array(program.SLACK_OF)
+        status = STATUS[int(told[program.CODE])]
+        solved = int(told[program.CODE]) == program.SUCCESS
+        order = np.array(layout.SLACK_OF)
         ladder = batch.ladders.get(row)
         return {
             "status": status.value,
             "seconds": batch.seconds / len(batch),
-            "iterations": int(told[rti.INNER]),
-            "cost": float(told[rti.COST]),
-            "slack": told[rti.SLACK : rti.SLACK + 3][order] if solved else None,
+            "iterations": int(told[program.INNER]),
+            "cost": float(told[program.COST]),
+            "slack": told[program.SLACK : program.SLACK + 3][order] if solved else None,
             "fallback": "" if solved or ladder is None else ladder.fallback,
             "plan": batch.states[row, :, 4:].copy() if solved else None,
         }

@@ -5,29 +5,29 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc import linearisation, program, qp, rti, sqp
+from agents.nmpc import layout, linearisation, program, rti, sqp
 from agents.nmpc.linearisation import Linearisation
-from agents.nmpc.problem import INPUTS, STATES, NmpcProblem, Solution, Status
+from agents.nmpc.problem import STATES, NmpcProblem, Solution, Status
 
 Array = NDArray[np.float64]
 
 STATUS = {
-    rti.SUCCESS: Status.SUCCESS,
-    rti.MAXITER: Status.MAXITER,
-    rti.NOT_FINITE: Status.NAN,
-    rti.QP_FAILURE: Status.QP_FAILURE,
+    program.SUCCESS: Status.SUCCESS,
+    program.MAXITER: Status.MAXITER,
+    program.NOT_FINITE: Status.NAN,
+    program.QP_FAILURE: Status.QP_FAILURE,
 }
 DAMPING = (0.0, 0.0)
 """Levenberg term on (a, delta), by default."""
 
 
 def limits(problem: NmpcProblem, damping: tuple[float, float]) -> Array:
-    """Numbers of the quadratic program as `program` takes them, (LIMITS_SIZE,)."""
+    """The last of a solver's constants (`layout`): bounds, prices and damping."""
     car = problem.vehicle
     first, steps = problem.input_steps[0], problem.input_steps[-1]
     if problem.horizon == 1:
         steps = first
-    order = np.array(program.SLACK_OF)
+    order = np.array(layout.SLACK_OF)
     return np.array(
         [
             *car.acceleration_range,
@@ -98,9 +98,9 @@ class RtiSolver:
             ]
         )
         n = problem.horizon
-        self._work = np.zeros(rti.space(n))
-        self._told = np.zeros(rti.TOLD)
-        self._states, self._slack = np.zeros((n + 1, STATES)), np.zeros((3, n))
+        stages, lanes = layout.working_space(n, 1)
+        self._stages, self._lanes = stages[0], lanes[0]
+        self._told = np.zeros(program.TOLD)
         self._iterations = iterations
 
     def solve(
@@ -128,18 +128,17 @@ class RtiSolver:
             plan = np.tile(last, (n, 1))
         else:
             plan = warm.copy()
-            rti.shift(plan, self.constants[rti.SHIFT])
-        given = (
-            np.ascontiguousarray(state, dtype=np.float64), last,
-            np.ascontiguousarray(reference, dtype=np.float64),
-            np.ascontiguousarray(weights, dtype=np.float64),
-        )  # fmt: skip
+            plan[:-1] += self.constants[layout.SHIFT] * (plan[1:] - plan[:-1])
+        given = state, last, reference, np.ascontiguousarray(weights, dtype=np.float64)
         if self._iterations == 1:
+            self._prepare(state, plan, reference)
             code = rti.solve(
-                *given, self.constants, plan, self._states, self._slack, self._told, self._work
-            )
-            status, cost = STATUS[code], float(self._told[rti.COST])
-            iterations = int(self._told[rti.OUTER])
+                self._stages, self._lanes, float(last[0]), float(last[1]), given[-1],
+                self.constants, self._told,
+            )  # fmt: skip
+            status, iterations = STATUS[code], int(self._told[program.OUTER])
+            plan, cost = self._inputs(), float(self._told[program.COST])
+            found = layout.NOW_VX
         else:
             status, plan, iterations = sqp.converge(
                 self._bounded(plan, last),
@@ -149,14 +148,15 @@ class RtiSolver:
                 self._iterations,
             )
             cost = self._price(plan, given)
+            found = layout.STEP_VX
         seconds = time.perf_counter() - began
         if status is not Status.SUCCESS:
             return Solution(status, None, None, None, np.nan, iterations, seconds), None
         solution = Solution(
             status,
             plan,
-            self._states.copy(),
-            self._slack[list(program.SLACK_OF)].T.copy(),
+            self._stages[:, found : found + STATES].copy(),
+            self._lanes[np.array(layout.SLACKS)[list(layout.SLACK_OF)]].T.copy(),
             cost,
             iterations,
             seconds,
@@ -164,53 +164,45 @@ class RtiSolver:
         return solution, plan
 
     def _bounded(self, inputs: Array, last: Array) -> Array:
-        bounded = np.ascontiguousarray(inputs, dtype=np.float64)
-        program.clamp(bounded, last, self.constants[rti.LIMITS :])
-        return bounded
+        """Inputs (N, 2) within their bounds and rates."""
+        tried: Array = self._stages[:-1, layout.STEP_A : layout.STEP_DELTA + 1]
+        tried[:] = inputs
+        sqp.bound(self._stages, float(last[0]), float(last[1]), self.constants)
+        return tried.copy()
 
     def _price(self, inputs: Array, given: tuple[Array, Array, Array, Array]) -> float:
-        """Exact cost of a plan; its roll-out and slack are left in this solver's arrays."""
+        """Exact cost of a plan; its roll-out and slacks are left in the working space."""
         state, _, reference, weights = given
-        self._states[0] = state
-        constants = self.constants
-        linearisation.roll_out(
-            inputs, constants, constants[rti.STEP], int(constants[rti.SUBSTEPS]), self._states
-        )
-        return float(sqp.evaluate(self._states, inputs, self._slack, reference, weights, constants))
+        self._prepare(state, inputs, reference)
+        self._stages[:-1, layout.STEP_A : layout.STEP_DELTA + 1] = inputs
+        return float(sqp.evaluate(self._stages, self._lanes, weights, self.constants))
 
     def linearise(self, state: Array, inputs: Array) -> Linearisation:
         """Roll `inputs` (N, 2) out from `state` (6,) and differentiate along the way."""
-        states, records = self._records(state, inputs)
-        return linearisation.unpacked(states, records)
+        self._prepare(state, inputs, None)
+        linearisation.differentiate_along(self._stages, self.constants)
+        return linearisation.unpacked(self._stages)
 
     def solve_qp(
         self, state: Array, last_input: Array, reference: Array, weights: Array, inputs: Array
     ) -> tuple[Status, Array]:
         """Solve the program linearised along the roll-out of `inputs` (N, 2); its inputs."""
-        plan = np.ascontiguousarray(inputs, dtype=np.float64)
-        base, records = self._records(state, plan)
-        n = self.problem.horizon
-        found, states, slack = np.zeros((n, INPUTS)), np.zeros((n + 1, STATES)), np.zeros((3, n))
-        code, _ = qp.solve_qp(
-            records, base, plan, np.asarray(last_input, dtype=np.float64),
-            np.ascontiguousarray(reference, dtype=np.float64),
-            np.asarray(weights, dtype=np.float64), self.constants[rti.LIMITS :],
-            self.constants[rti.TOLERANCE], states, found, slack, self._work,
+        self._prepare(state, inputs, reference)
+        code = program.solve_program(
+            self._stages, self._lanes, float(last_input[0]), float(last_input[1]),
+            np.ascontiguousarray(weights, dtype=np.float64), self.constants, self._told,
         )  # fmt: skip
-        status = {
-            qp.OPTIMAL: Status.SUCCESS,
-            qp.OUT_OF_ITERATIONS: Status.MAXITER,
-            qp.BROKEN: Status.QP_FAILURE,
-        }[code]
-        return status, found
+        return STATUS[code], self._inputs()
 
-    def _records(self, state: Array, inputs: Array) -> tuple[Array, Array]:
-        n = len(inputs)
-        states, records = np.zeros((n + 1, STATES)), np.zeros((n, linearisation.RECORD))
-        states[0] = state
-        linearisation.differentiate_along(
-            np.ascontiguousarray(inputs, dtype=np.float64), self.constants,
-            self.constants[rti.STEP], int(self.constants[rti.SUBSTEPS]), states, records,
-            np.zeros(linearisation.SCRATCH),
-        )  # fmt: skip
-        return states, records
+    def _prepare(self, state: Array, plan: Array, reference: Array | None) -> None:
+        """Put a first state (6,), a plan (N, 2) and a reference (N + 1, 4) into the stages."""
+        stages = self._stages
+        stages[0, layout.PLAN_VX : layout.PLAN_Y + 1] = state
+        stages[:-1, layout.PLAN_A : layout.PLAN_DELTA + 1] = plan
+        if reference is not None:
+            stages[:, layout.REFERENCE : layout.REFERENCE_Y + 1] = reference
+
+    def _inputs(self) -> Array:
+        """The solution's inputs, (N, 2)."""
+        inputs: Array = self._stages[:-1, layout.NOW_A : layout.NOW_DELTA + 1].copy()
+        return inputs

@@ -14,10 +14,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.nmpc.layout import (
+    HIGH_RATE,
+    HIGH_SPEED,
+    LOW_RATE,
+    LOW_SPEED,
+    PLAN_A,
+    POINT,
+    RATIO,
+    SLACKS,
+    STEP_A,
+    STEP_DELTA,
+    STEP_R,
+    STEP_VX,
+    STEP_VY,
+)
+from agents.nmpc.linearisation import advance
 from agents.nmpc.problem import Status
-from agents.nmpc.program import HIGH_RATE, HIGH_SPEED, LOW_RATE, LOW_SPEED, RATIO
-from agents.nmpc.rti import LIMITS, cost_of
-from lpv_track_env.bicycle import VX, VY, YAW_RATE, compiled_field, compiled_inverse_speed
+from agents.nmpc.program import clamp
+from agents.nmpc.rti import cost_of
+from agents.nmpc.vectors import taken
+from lpv_track_env.bicycle import compiled_field, compiled_inverse_speed
 from trajectories.compilation import compiled
 
 Array = NDArray[Any]
@@ -34,22 +51,32 @@ PATIENCE = 8
 
 
 @compiled
-def evaluate(
-    states: Array, inputs: Array, slack: Array, reference: Array, weights: Array, constants: Array
-) -> Float:
-    """Exact cost of a plan: states (N + 1, 6) are its roll-out; fills slack (3, N)."""
-    p, limits = constants, constants[LIMITS:]
-    for i in range(inputs.shape[0]):
-        a, delta, x = inputs[i, 0], inputs[i, 1], states[i]
+def evaluate(stages: Array, lanes: Array, weights: Array, constants: Array) -> Float:
+    """Exact cost of the inputs in the stages' STEP: rolls them out there and fills the slacks."""
+    p = constants
+    for k in range(2, POINT):
+        stages[0, STEP_A + k] = stages[0, PLAN_A + k]
+    for i in range(lanes.shape[1]):
+        e, end = stages[i], stages[i + 1]
+        a, delta = e[STEP_A], e[STEP_DELTA]
+        following = advance(taken(e, STEP_VX), a, delta, p)
+        for k in range(6):
+            end[STEP_VX + k] = following[k]
         rate = compiled_field(
-            x[VX], x[VY], x[YAW_RATE], 1.0, 0.0, a, delta, math.cos(delta), math.sin(delta),
-            compiled_inverse_speed(x[VX]), p[0], p[1], p[2], p[3], p[4], p[5], p[6],
+            e[STEP_VX], e[STEP_VY], e[STEP_R], 1.0, 0.0, a, delta, math.cos(delta), math.sin(delta),
+            compiled_inverse_speed(e[STEP_VX]), p[0], p[1], p[2], p[3], p[4], p[5], p[6],
         )[0]  # fmt: skip
-        vx, vy = states[i + 1, VX], states[i + 1, VY]
-        slack[0, i] = max(limits[LOW_SPEED] - vx, vx - limits[HIGH_SPEED], 0.0)
-        slack[1, i] = max(limits[LOW_RATE] - rate, rate - limits[HIGH_RATE], 0.0)
-        slack[2, i] = max(abs(vy) - limits[RATIO] * vx, 0.0)
-    return cost_of(states, inputs, slack, reference, weights, limits)
+        vx, vy = end[STEP_VX], end[STEP_VY]
+        lanes[SLACKS[0], i] = max(p[LOW_SPEED] - vx, vx - p[HIGH_SPEED], 0.0)
+        lanes[SLACKS[1], i] = max(p[LOW_RATE] - rate, rate - p[HIGH_RATE], 0.0)
+        lanes[SLACKS[2], i] = max(abs(vy) - p[RATIO] * vx, 0.0)
+    return cost_of(stages, lanes, STEP_A, weights, constants)
+
+
+@compiled
+def bound(stages: Array, last_a: Float, last_delta: Float, constants: Array) -> None:
+    """Bring the inputs in the stages' STEP within their bounds and rates."""
+    clamp(stages, STEP_A, last_a, last_delta, constants)
 
 
 def converge(
