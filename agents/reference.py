@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.vehicle import VehicleParameters
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled, compiled_internal
 
 Array = NDArray[Any]
 
@@ -95,7 +95,7 @@ def local_reference(observation: TrackingObservation, period: float) -> LocalRef
     )
 
 
-@compiled
+@compiled_internal
 def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, nodes: Array) -> None:
     """Fill nodes (n + 1, NODE) from the first n intervals of one preview."""
     s = x = y = heading = 0.0

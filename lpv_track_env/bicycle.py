@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.vehicle import VehicleParameters
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled, compiled_internal
 
 VX, VY, PSI, YAW_RATE, X, Y = range(6)
 STATE_NAMES = ("vx", "vy", "psi", "r", "X", "Y")
@@ -259,13 +259,13 @@ def fastest_pole(vx: float, parameters: VehicleParameters) -> float:
     return float(np.abs(np.linalg.eigvals(block)).max())
 
 
-compiled_field = compiled(field)
-compiled_jacobian = compiled(jacobian)
+compiled_field = compiled_internal(field)
+compiled_jacobian = compiled_internal(jacobian)
 compiled_inverse_speed_polynomial = compiled(inverse_speed_polynomial)
 compiled_inverse_speed_slope_polynomial = compiled(inverse_speed_slope_polynomial)
 
 
-@compiled
+@compiled_internal
 def compiled_inverse_speed(vx: float) -> float:
     """q(vx) inside compiled kernels, for a single vehicle: no polynomial where it is 1/|vx|."""
     speed = abs(vx)
@@ -275,7 +275,7 @@ def compiled_inverse_speed(vx: float) -> float:
     return value
 
 
-@compiled
+@compiled_internal
 def compiled_inverse_speed_of_lanes(vx: float) -> float:
     """The same number, bit for bit, without a branch: for loops over vehicles side by side.
 
@@ -288,7 +288,7 @@ def compiled_inverse_speed_of_lanes(vx: float) -> float:
     return value
 
 
-@compiled
+@compiled_internal
 def compiled_inverse_speed_slope(vx: float) -> float:
     """dq/dvx inside compiled kernels."""
     speed = abs(vx)

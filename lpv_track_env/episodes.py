@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lpv_track_env import kernels
 from lpv_track_env.bicycle import PSI, VX, X, Y
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled, compiled_internal
 from trajectories.interpolation import heading_at, position_at, speed_at
 
 Array = NDArray[Any]
@@ -61,7 +61,7 @@ def given_start(options: Mapping[str, Any], length: float) -> NDArray[np.float64
     return start
 
 
-@compiled
+@compiled_internal
 def mix(z: Any) -> Any:
     """Finaliser of splitmix64: a bijection of 64-bit numbers that scatters them."""
     z = (z ^ (z >> SHIFTS[0])) * FIRST_FACTOR
@@ -69,7 +69,7 @@ def mix(z: Any) -> Any:
     return z ^ (z >> SHIFTS[2])
 
 
-@compiled
+@compiled_internal
 def uniform(key: Any, episode: Any, draw: int) -> Any:
     """Number in [0, 1) for a key (uint64), an episode (from 0) and a draw."""
     z = mix(key + GOLDEN * (np.uint64(episode) + np.uint64(1)))
@@ -77,13 +77,13 @@ def uniform(key: Any, episode: Any, draw: int) -> Any:
     return np.float64(z >> SHIFTS[3]) * 2.0**-53
 
 
-@compiled
+@compiled_internal
 def choice(key: Any, episode: Any, draw: int, count: int) -> int:
     """One of `count` indices."""
     return min(int(uniform(key, episode, draw) * count), count - 1)
 
 
-@compiled
+@compiled_internal
 def error(given: Any, half: Any, key: Any, episode: Any, draw: int) -> Any:
     """Initial error: as given, or uniform within +-half."""
     if not math.isnan(given):

@@ -13,7 +13,7 @@ from lpv_track_env.bicycle import (
     compiled_inverse_speed,
     compiled_inverse_speed_of_lanes,
 )
-from trajectories.compilation import compiled, compiled_inline
+from trajectories.compilation import compiled_inline, compiled_internal
 
 
 @compiled_inline
@@ -33,7 +33,7 @@ def rotate(c: Any, s: Any, angle: Any) -> tuple[Any, Any]:
     return c * dc - s * ds, s * dc + c * ds
 
 
-@compiled
+@compiled_internal
 def inverse_speed(vx: Any, lanes: bool) -> Any:
     """q(vx), see `bicycle`: by a branch, or without one; `lanes` is a constant where it is used."""
     return compiled_inverse_speed_of_lanes(vx) if lanes else compiled_inverse_speed(vx)
@@ -82,7 +82,7 @@ def runge_kutta(
     )
 
 
-@compiled
+@compiled_internal
 def in_half_steps(
     half: Any, p0: Any, p1: Any, p2: Any, p3: Any, p4: Any, p5: Any, p6: Any
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
@@ -100,7 +100,7 @@ def in_half_steps(
     )  # fmt: skip
 
 
-@compiled
+@compiled_internal
 def integrate(
     vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, a: Any, delta: Any,
     p0: Any, p1: Any, p2: Any, p3: Any, p4: Any, p5: Any, p6: Any, h: Any, substeps: int,

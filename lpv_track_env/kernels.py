@@ -1,7 +1,7 @@
 """Compiled kernels of path tracking: actuators, integration, projection, reward, observation.
 
 The scalar functions `actuate`, `integrate`, `observe` and `judge` are what every environment
-shares; `step` and `start` work on one episode's arrays, `advance` on all of a single environment
+shares; `drive` and `start` work on one episode's arrays, `advance` on all of a single environment
 packed into one array. The indices below name the arrays' entries.
 """
 
@@ -15,7 +15,7 @@ from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.integration import integrate
 from lpv_track_env.observation import PREVIEW_BOUNDS, SCALARS
 from lpv_track_env.reward import terms
-from trajectories.compilation import compiled, compiled_in_place, compiled_inline
+from trajectories.compilation import compiled, compiled_in_place, compiled_inline, compiled_internal
 from trajectories.interpolation import cell, saturate, speed_in
 from trajectories.preview import fill_preview
 from trajectories.projection import SEARCH_WINDOW, follow
@@ -61,13 +61,13 @@ BOUNDS = tuple(bound for _, _, bound in SCALARS)
 CURVATURE_BOUND, SPEED_BOUND = (bound for _, _, bound in PREVIEW_BOUNDS)
 
 
-@compiled
+@compiled_internal
 def clip(value: Any, low: Any, high: Any) -> Any:
     """`value` within [low, high]."""
     return min(max(value, low), high)
 
 
-@compiled
+@compiled_internal
 def wrap(angle: Any) -> Any:
     """Angle in (-pi, pi]; exact (untouched) where it already lies there."""
     if -math.pi < angle <= math.pi:
@@ -76,7 +76,7 @@ def wrap(angle: Any) -> Any:
     return math.pi if wrapped == -math.pi else wrapped
 
 
-@compiled
+@compiled_internal
 def actuate(
     a: Any,
     delta: Any,
@@ -229,17 +229,6 @@ def drive(
         p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[PERIOD] / substeps, substeps,
     )  # fmt: skip
     return finish(memory, constants, table, observation, vx, vy, psi, r, x, y, a, delta, bits)
-
-
-@compiled
-def step(
-    memory: Array, action: Array, constants: Array, table: Array, _bound: Array, observation: Array
-) -> int:
-    """One control period of an episode, in place; returns the code of its end.
-
-    `_bound` is not read: entries of the observation saturate at their own bounds.
-    """
-    return drive(memory, action[0], action[1], constants, table, observation)
 
 
 @compiled

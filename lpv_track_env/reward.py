@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled_internal
 
 TERMS = ("progress", "lateral", "heading", "speed", "input_rate", "end")
 """Order of the reward's terms."""
@@ -54,13 +54,13 @@ class RewardWeights:
         return np.array([getattr(self, field.name) for field in fields(self)], dtype=np.float64)
 
 
-@compiled
+@compiled_internal
 def pseudo_huber(z: Any) -> Any:
     """sqrt(1 + z^2) - 1."""
     return np.sqrt(1.0 + z * z) - 1.0
 
 
-@compiled
+@compiled_internal
 def terms(
     weights: Any,
     period: Any,

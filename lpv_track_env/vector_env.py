@@ -1,13 +1,11 @@
 """Many path tracking environments stepped at once, in compiled code."""
 
 import operator
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
-import numba
 import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -19,6 +17,7 @@ from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.episodes import GIVEN, given_start, random_key
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task, action_space, choose
+from lpv_track_env.threads import checked_threads, using_threads
 from lpv_track_env.vector_infos import episode_infos, final_infos
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
@@ -51,8 +50,6 @@ class KernelArrays(NamedTuple):
     """(nodes, 8), all paths one after another."""
     rows: Array
     """(cases, 2), first row of each table and the one after its last."""
-    bound: Array
-    """(size,) float32."""
 
 
 class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
@@ -153,7 +150,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._mode = MODES[self.autoreset_mode]
         self.metadata = {**self._single.metadata, **self.metadata}
         self.metadata["autoreset_mode"] = self.autoreset_mode
-        self._threads = _checked_threads(threads)
+        self._threads = checked_threads(threads)
         self._paths, self._cars = paths, cars
         self._drawn = (0, len(paths), len(cars))
         self.tasks = self._tasks_of(paths, cars)
@@ -163,11 +160,11 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         n, size = self.num_envs, self._single.layout.size
-        self._bound = self._single.layout.bound
         self._memories = np.zeros((n, kernels.MEMORY_SIZE))
         self._final_memories = np.zeros((n, kernels.MEMORY_SIZE))
         self._observations = np.zeros((n, size), dtype=np.float32)
         self._final_observations = np.zeros((n, size), dtype=np.float32)
+        self._scratch = np.zeros((self._threads, vector_kernels.SCRATCH_SIZE))
         self._cases = np.zeros(n, dtype=np.int64)
         self._keys = np.zeros(n, dtype=np.uint64)
         self._episodes = np.full(n, -1)
@@ -216,7 +213,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         """Arrays of the current episodes, not copies, for compiled code that steps them itself."""
         return KernelArrays(
             self._memories, self._observations, self._ends, self._cases, self._constants,
-            self._tables, self._rows, self._bound,
+            self._tables, self._rows,
         )  # fmt: skip
 
     @property
@@ -311,9 +308,10 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             self._observations, self._ends, rewards, self._final_memories, self._final_observations,
         )  # fmt: skip
         if self._threads == 1:
-            vector_kernels.advance(0, n, *arguments)
+            vector_kernels.advance(0, n, *arguments, self._scratch[0])
         else:
-            _in_threads(self._threads, n, arguments)
+            with using_threads(self._threads):
+                vector_kernels.advance_in_threads(self._threads, n, *arguments, self._scratch)
         ended = self._ends != kernels.RUNNING
         truncated = self._ends == kernels.TIME_LIMIT
         # A copy: a reset of some environments hands out the others' observations again.
@@ -402,26 +400,3 @@ def _checked_mode(value: AutoresetMode | str) -> AutoresetMode:
         return value
     known = tuple(mode.value for mode in AutoresetMode)
     return AutoresetMode(choose("autoreset_mode", value, known))
-
-
-def _checked_threads(value: int) -> int:
-    threads = operator.index(value)
-    most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-    if not 1 <= threads <= most:
-        raise ValueError(
-            f"threads must be from 1 to {most} (the processors numba sees; NUMBA_NUM_THREADS sets "
-            f"it), not {value}"
-        )
-    if threads > 1:
-        # Else threads that wait spin, and on a busy machine a step takes 700 times as long.
-        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    return threads
-
-
-def _in_threads(threads: int, n: int, arguments: tuple[Any, ...]) -> None:
-    before = numba.get_num_threads()
-    numba.set_num_threads(threads)
-    try:
-        vector_kernels.advance_in_threads(threads, n, *arguments)
-    finally:
-        numba.set_num_threads(before)

@@ -9,14 +9,13 @@ import math
 from typing import Any
 
 import numba
-import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.episodes import TRAJECTORY_DRAW, VEHICLE_DRAW, begin, choice
 from lpv_track_env.integration import in_half_steps, integrate, rotate, runge_kutta
-from trajectories.compilation import compiled, compiled_inline, compiled_parallel
+from trajectories.compilation import compiled, compiled_inline, compiled_internal, compiled_parallel
 
 Array = NDArray[Any]
 
@@ -27,14 +26,14 @@ LANES = 32
 COS, SIN, ACCELERATION, STEERING, COS_STEERING, SIN_STEERING, PARAMETERS = (
     6 * LANES, 7 * LANES, 8 * LANES, 9 * LANES, 10 * LANES, 11 * LANES, 12 * LANES,
 )  # fmt: skip
-SUBSTEP, CLIPPED, PUSH = 18 * LANES, 19 * LANES, 20 * LANES
-SCRATCH_SIZE = 21 * LANES
+SUBSTEP, CLIPPED, PUSH, SUBSTEPS = 18 * LANES, 19 * LANES, 20 * LANES, 21 * LANES
+SCRATCH_SIZE = 22 * LANES
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)
 """When an environment that has ended is reset, as `gymnasium.vector.AutoresetMode` says."""
 
 
-@compiled
+@compiled_internal
 def integrate_lanes(b: Array, substeps: int) -> None:
     """Runge-Kutta steps of all lanes of a scratch, the same number for each."""
     for j in range(LANES):
@@ -62,8 +61,8 @@ def integrate_lanes(b: Array, substeps: int) -> None:
 
 
 @compiled_inline
-def load_lane(b: Array, j: int, memory: Array, action: Array, p: Array) -> int:
-    """Copy a vehicle into lane j: state, what its actuators give, parameters; its substeps."""
+def load_lane(b: Array, j: int, memory: Array, action: Array, p: Array) -> None:
+    """Copy a vehicle into lane j: state, what its actuators give, parameters, substeps."""
     a, delta, bits = k.actuate(
         action[0], action[1], memory[k.ACCELERATION], memory[k.STEERING],
         p[k.MAX_STEERING], p[k.STEERING_STEP], p[k.LOWEST_ACCELERATION],
@@ -74,17 +73,15 @@ def load_lane(b: Array, j: int, memory: Array, action: Array, p: Array) -> int:
     b[COS + j], b[SIN + j] = math.cos(memory[PSI]), math.sin(memory[PSI])
     b[ACCELERATION + j], b[STEERING + j] = a, delta
     b[COS_STEERING + j], b[SIN_STEERING + j] = math.cos(delta), math.sin(delta)
-    substeps = int(p[k.SUBSTEPS])
-    h = p[k.PERIOD] / substeps
-    b[SUBSTEP + j] = h
+    h = p[k.PERIOD] / p[k.SUBSTEPS]
+    b[SUBSTEP + j], b[SUBSTEPS + j] = h, p[k.SUBSTEPS]
     q = in_half_steps(0.5 * h, p[0], p[1], p[2], p[3], p[4], p[5], p[6])
     for row in range(len(q)):
         b[PARAMETERS + row * LANES + j] = q[row]
     b[CLIPPED + j] = bits
-    return substeps
 
 
-@compiled
+@compiled_internal
 def integrate_one(b: Array, j: int, memory: Array, p: Array) -> None:
     """Integrate lane j alone: for blocks whose vehicles need different numbers of substeps."""
     substeps = int(p[k.SUBSTEPS])
@@ -112,7 +109,7 @@ def first_bad(commands: Array, ends: Array, mode: int) -> int:
     return -1
 
 
-@compiled
+@compiled_internal
 def begin_next(
     i: int, memory: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
     rows: Array, observation: Array, keys: Array, episodes: Array, given: Array,
@@ -133,32 +130,38 @@ def begin_next(
     begin(memory, constants[case], table, observation, keys[i], episodes[i], given)
 
 
+@compiled_internal
+def copy(source: Array, target: Array) -> None:
+    """Copy a vector; an assignment would want memory for the case that the two overlap."""
+    for j in range(source.shape[0]):
+        target[j] = source[j]
+
+
 @compiled
 def advance(
     first: int, last: int, mode: int,
     memories: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
     rows: Array, keys: Array, episodes: Array, given: Array,
     observations: Array, ends: Array, rewards: Array, final_memories: Array,
-    final_observations: Array,
+    final_observations: Array, b: Array,
 ) -> None:  # fmt: skip
     """One control period of the environments `first` to `last` - 1, with autoreset.
 
     `ends` (n,) holds each environment's end code of the last step and is given the new one. In
     NEXT_STEP an environment that had ended begins anew instead, with reward 0; in SAME_STEP one
-    that ends begins anew at once, its last memory and observation kept in the `final_` arrays.
+    that ends begins anew at once, its last memory and observation kept in the `final_` arrays. `b`
+    is scratch, (SCRATCH_SIZE,).
     """
-    b = np.empty(SCRATCH_SIZE)
-    counts = np.empty(LANES, dtype=np.int64)
     for low in range(first, last, LANES):
         lanes = min(LANES, last - low)
         uniform = True
         for j in range(LANES):
             # Lanes beyond the last environment repeat the first: no lane holds rubbish.
             i = low + j if j < lanes else low
-            counts[j] = load_lane(b, j, memories[i], actions[i], constants[cases[i]])
-            uniform = uniform and counts[j] == counts[0]
+            load_lane(b, j, memories[i], actions[i], constants[cases[i]])
+            uniform = uniform and b[SUBSTEPS + j] == b[SUBSTEPS]
         if uniform:
-            integrate_lanes(b, counts[0])
+            integrate_lanes(b, int(b[SUBSTEPS]))
         else:
             for j in range(lanes):
                 integrate_one(b, j, memories[low + j], constants[cases[low + j]])
@@ -179,8 +182,8 @@ def advance(
                 rewards[i] = memory[k.REWARD]
                 if mode == SAME_STEP and ends[i] != k.RUNNING:
                     begins = True
-                    final_memories[i] = memory
-                    final_observations[i] = observation
+                    copy(memory, final_memories[i])
+                    copy(observation, final_observations[i])
             # One call for both modes: every call is compiled in.
             if begins:
                 begin_next(
@@ -195,9 +198,12 @@ def advance_in_threads(
     memories: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
     rows: Array, keys: Array, episodes: Array, given: Array,
     observations: Array, ends: Array, rewards: Array, final_memories: Array,
-    final_observations: Array,
+    final_observations: Array, scratch: Array,
 ) -> None:  # fmt: skip
-    """`advance` on all n environments, in chunks of whole blocks that threads share."""
+    """`advance` on all n environments, in chunks of whole blocks that threads share.
+
+    Each chunk has its own row of `scratch`.
+    """
     blocks = (n + LANES - 1) // LANES
     for chunk in numba.prange(chunks):
         first = chunk * blocks // chunks * LANES
@@ -205,7 +211,7 @@ def advance_in_threads(
         advance(
             first, last, mode, memories, actions, cases, drawn, constants, tables, rows,
             keys, episodes, given, observations, ends, rewards, final_memories,
-            final_observations,
+            final_observations, scratch[chunk],
         )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Compiled functions: their results, and a cache that is never stale."""
 
+import gc
 import math
 import os
 import subprocess
@@ -11,6 +12,8 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from numba.core import event
+from numba.core.types.functions import BaseFunction
 
 from trajectories import compilation
 from trajectories.compilation import compiled, entry_point, source_digest
@@ -106,6 +109,45 @@ def test_entry_point_is_the_compiled_function_for_these_types() -> None:
     assert entry_point(first_of_sum, row, 1.0) is entry_point(first_of_sum, row + 1.0, 0.0)
     assert entry_point(first_of_sum, row, 1.0) is not entry_point(first_of_sum, column, 1.0)
     assert entry_point(python_sum, 1.0, 2.0, 3.0) is python_sum
+
+
+def test_internal_functions_can_be_called_from_python_too() -> None:
+    internal = compilation.compiled_internal(python_sum)
+    assert internal(1e16, -1e16, 1.0) == 1.0
+    assert internal(1, 2, 3) == 6
+    # For all integers that compiled code writes out there is one version.
+    caller = numba.njit(lambda x: internal(x, 1, 2) + internal(x, 3, 4) + internal(x, 5, 6))
+    assert caller(0.5) == 22.5
+    assert len(internal.signatures) == 3  # type: ignore[attr-defined]
+
+
+def test_what_shortens_compiling_is_undone_after_it() -> None:
+    plain = BaseFunction.get_call_type
+    seen = []
+
+    @compiled
+    def product(x: Any, y: Any) -> Any:
+        return x * y
+
+    class Spy(event.Listener):
+        def on_start(self, _: event.Event) -> None:
+            seen.append((BaseFunction.get_call_type is plain, gc.isenabled()))
+
+        def on_end(self, _: event.Event) -> None:
+            pass
+
+    spy = Spy()
+    event.register("numba:compile", spy)  # type: ignore[no-untyped-call]
+    try:
+        assert product(3.0, 0.5) == 1.5
+        assert product(3, 5) == 15
+        with pytest.raises(numba.TypingError):
+            product("a", 1.5)
+    finally:
+        event.unregister("numba:compile", spy)  # type: ignore[no-untyped-call]
+    assert seen[0] == (False, False)
+    assert BaseFunction.get_call_type is plain
+    assert gc.isenabled()
 
 
 def run(code: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -1,5 +1,6 @@
 """The real-time NMPC as an agent of batches: memories, weights, and observations of every kind."""
 
+import numba
 import numpy as np
 import pytest
 from driven_vehicles import drives, environment, made
@@ -11,12 +12,18 @@ from trajectories import CurvatureBands
 
 BEGIN = np.array([True])
 
+
+def most_threads() -> int:
+    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+
+
 # Batches and memories ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("n", [1, 3, 17])
-def test_batch_is_single_vehicles_bit_for_bit(n: int) -> None:
-    rows, together = drives(n, 8), made()
+@pytest.mark.parametrize("threads", [1, min(2, most_threads())])
+def test_batch_is_single_vehicles_bit_for_bit(n: int, threads: int) -> None:
+    rows, together = drives(n, 8), made(threads=threads)
     batches = [together.predict(row)[0] for row in rows]
     alone = made()
     for k in range(n):
@@ -62,6 +69,24 @@ def test_failures_of_one_row_are_not_anothers() -> None:
     assert [row[1] for row in told] == ["", "", "plan", "plan", "stop", "stop", "stop", "stop"]
     assert [row[2] for row in told] == ["", "", "", "", "plan", "plan", "stop", "stanley"]
     assert not any(row[0] for row in told)
+
+
+def test_failures_are_found_in_every_threads_share() -> None:
+    rows, alone, shared = drives(5, 4), made(), made(threads=min(2, most_threads()))
+    for row in rows:
+        lost = row.copy()
+        lost[[0, 4], 5] = np.nan
+        np.testing.assert_array_equal(alone.predict(lost)[0], shared.predict(lost)[0])
+    memory = shared.predict(lost)[1]
+    assert [shared.diagnostics(memory[k])["fallback"] for k in range(5)] == [
+        "stanley", "", "", "", "stanley"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("threads", [0, -1, 10_000])
+def test_impossible_threads_are_refused(threads: int) -> None:
+    with pytest.raises(ValueError, match=rf"threads must be from 1 to \d+ .*, not {threads}"):
+        made(threads=threads)
 
 
 def test_memories_are_handed_in_and_out() -> None:

@@ -1,6 +1,5 @@
 """Compile numerical functions with numba, cached on disk, never stale."""
 
-import gc
 import hashlib
 import sys
 import warnings
@@ -12,6 +11,8 @@ from typing import Any, TypeVar
 import numba
 from numba.core import event, types
 from numba.core.registry import CPUDispatcher
+
+from trajectories.compile_time import Arithmetic, Collector
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -72,29 +73,8 @@ class _Announcement(event.Listener):
         pass
 
 
-class _Collector(event.Listener):
-    """Keeps the garbage collector off while compiling, of which it would take a tenth.
-
-    What numba builds survives, so the collector would walk an ever larger heap and free little.
-    """
-
-    def __init__(self) -> None:
-        self.depth, self.was_on = 0, False
-
-    def on_start(self, event: event.Event) -> None:  # noqa: ARG002  part of the protocol
-        if self.depth == 0:
-            self.was_on = gc.isenabled()
-            gc.disable()
-        self.depth += 1
-
-    def on_end(self, event: event.Event) -> None:  # noqa: ARG002  part of the protocol
-        self.depth -= 1
-        if self.depth == 0 and self.was_on:
-            gc.enable()
-
-
 PACKAGES = ("trajectories", "lpv_track_env", "agents", "experiments")
-for _listener in (_Announcement(), _Collector()):
+for _listener in (_Announcement(), Collector(), Arithmetic()):
     event.register("numba:compile", _listener)  # type: ignore[no-untyped-call]
 
 
@@ -116,10 +96,13 @@ def compiled_in_place(function: Function) -> Function:
 
 
 class _Internal(CPUDispatcher):
-    """A compiled function without an entry from Python, which numba alone would crash on."""
+    """A compiled function without wrappers; a call from Python makes itself an entry first."""
 
-    def __call__(self, *_: object, **__: object) -> Any:
-        raise TypeError(f"{self.py_func.__qualname__} can be called by compiled code only")
+    def __call__(self, *arguments: Any) -> Any:
+        if not hasattr(self, "_entry"):
+            internal = self
+            self._entry = numba.njit(lambda *given: internal(*given))  # noqa: PLW0108
+        return self._entry(*arguments)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         # Without this, numba compiles a version of its own for every integer that callers write.
@@ -129,22 +112,21 @@ class _Internal(CPUDispatcher):
 
 def _plain(kind: Any) -> Any:
     """Numba type of a literal integer's value, for its own; any other type as it is."""
-    return types.unliteral(kind)  # type: ignore[no-untyped-call]
+    return kind.literal_type if isinstance(kind, types.IntegerLiteral) else kind
 
 
 def compiled_internal(function: Function) -> Function:
-    """`compiled`, for what only compiled code calls: half the wait, for lack of wrappers.
+    """`compiled`, for what compiled code calls: half the wait, for lack of wrappers.
 
-    Unboxing a few arrays takes longer to compile than a short function that works on them.
+    Unboxing a few arrays takes longer to compile than a short function that works on them. Python
+    may call it too, but compiles an entry in each process: for tests.
     """
-    dispatcher: Any = _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-    dispatcher.__class__ = _Internal
-    return dispatcher  # type: ignore[no-any-return]
+    return _compile_internal(function)
 
 
 def compiled_inline(function: Function) -> Function:
-    """`compiled`, and always inlined by LLVM: for the body of a loop that is to be vectorised."""
-    return _compile(function, forceinline=True)
+    """`compiled_internal`, always inlined by LLVM: for a loop that is to be vectorised."""
+    return _compile_internal(function, forceinline=True)
 
 
 def compiled_parallel(function: Function) -> Function:
@@ -152,7 +134,7 @@ def compiled_parallel(function: Function) -> Function:
 
     (A body that numba inlines into such a loop was seen to give wrong results.)
     """
-    return _compile(function, parallel=True)
+    return _compile(function, parallel=True, _nrt=True)
 
 
 def entry_point(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
@@ -168,8 +150,17 @@ def entry_point(function: Callable[..., Any], *arguments: Any) -> Callable[..., 
     return entry
 
 
+def _compile_internal(function: Function, **more: bool) -> Function:
+    dispatcher: Any = _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True, **more)
+    if isinstance(dispatcher, CPUDispatcher):
+        dispatcher.__class__ = _Internal
+    return dispatcher  # type: ignore[no-any-return]
+
+
 def _compile(function: Function, **more: bool | str) -> Function:
-    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False, **more}
+    # Without numba's runtime there are no references to count, which takes a tenth of the time to
+    # compile; no memory can be had either, but views of arrays can.
+    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False, "_nrt": False, **more}
     try:
         dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:

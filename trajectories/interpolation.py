@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trajectories.compilation import compiled
+from trajectories.compilation import compiled, compiled_internal
 
 X, Y, COS, SIN, HEADING, CURVATURE, SPEED, TIME = range(8)
 TABLE_COLUMNS = 8
@@ -22,7 +22,7 @@ Table = NDArray[np.float64]
 Float = Any
 
 
-@compiled
+@compiled_internal
 def saturate(value: Float, bound: Float) -> Float:
     """`value` within +-bound; NaN becomes 0, so what is written is always finite."""
     if value != value:  # noqa: PLR0124  NaN
@@ -30,7 +30,7 @@ def saturate(value: Float, bound: Float) -> Float:
     return min(max(value, -bound), bound)
 
 
-@compiled
+@compiled_internal
 def cell(s: Float, length: Float, closed: bool, n: int) -> tuple[int, Float]:
     """Cell index and offset (m) in it; s is wrapped on a closed path, clamped on an open one."""
     spacing = length / (n - 1)
@@ -136,14 +136,14 @@ def arc_length_at(table: Table, length: Float, closed: bool, time: Float, index:
     return laps * length + index * spacing + offset, index
 
 
-@compiled
+@compiled_internal
 def cubic(a: Float, ma: Float, b: Float, mb: Float) -> tuple[Float, Float, Float, Float]:
     """Coefficients in u (lowest first) of the Hermite cubic with ends a, b and slopes ma, mb."""
     d = b - a
     return a, ma, 3.0 * d - 2.0 * ma - mb, ma + mb - 2.0 * d
 
 
-@compiled
+@compiled_internal
 def heading_in(table: Table, h: Float, index: int, u: Float) -> Float:
     """Heading at u in [0, 1] of a cell h long, rad, of the first lap."""
     a, b = index, index + 1
@@ -153,7 +153,7 @@ def heading_in(table: Table, h: Float, index: int, u: Float) -> Float:
     return c0 + u * (c1 + u * (c2 + u * c3))
 
 
-@compiled
+@compiled_internal
 def speed_in(table: Table, index: int, u: Float) -> Float:
     """Speed of the reference at u in [0, 1] of a cell, m/s."""
     v0, v1 = table[index, SPEED], table[index + 1, SPEED]

@@ -242,11 +242,9 @@ class ReferencePath:
         time grid, 1/m; `speed` (count,): speed at each interval's end, m/s.
         """
         _finite("arc length and period", (s, period))
-        curvature, speed = np.empty(count), np.empty(count)
-        previewing.preview(
-            self.table, self.length, self.closed, float(s), float(period), curvature, speed
-        )
-        return Preview(curvature, speed)
+        values = np.empty(2 * count)
+        previewing.preview(self.table, self.length, self.closed, float(s), float(period), values)
+        return Preview(values[:count], values[count:])
 
     def with_speed(self, speed: ArrayLike, **metadata: Any) -> "ReferencePath":
         """Return the same geometry with another speed profile, a scalar or (n,), m/s."""

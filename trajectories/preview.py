@@ -85,20 +85,15 @@ def preview(
     closed: bool,
     s: Float,
     period: Float,
-    curvature: NDArray[Any],
-    speed: NDArray[Any],
+    values: NDArray[Any],
 ) -> None:
     """Fill the preview at s: what the reference does over the next `count` periods of its own time.
 
-    `curvature[k]`, shape (count,): mean signed curvature between the arc lengths that the reference
-    reaches k and k + 1 periods from now, so that headings at these nodes follow exactly;
-    `speed[k]`, shape (count,): its speed at node k + 1. An open path goes on straight at its last
-    speed.
+    `values`, (2 count,): first the mean signed curvature between the arc lengths that the reference
+    reaches k and k + 1 periods from now, so that headings at these nodes follow exactly; then its
+    speed at node k + 1. An open path goes on straight at its last speed.
     """
-    count = curvature.shape[0]
+    count = values.shape[0] // 2
     index, offset = cell(s, length, closed, table.shape[0])
     u = offset * (table.shape[0] - 1) / length
-    values = np.empty(2 * count)
     fill_preview(table, length, closed, s, index, u, period, values, 0, count, math.inf, math.inf)
-    curvature[:] = values[:count]
-    speed[:] = values[count:]

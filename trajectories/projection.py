@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from trajectories.compilation import compiled, compiled_inline
+from trajectories.compilation import compiled, compiled_inline, compiled_internal
 from trajectories.interpolation import (
     COS,
     CURVATURE,
@@ -33,7 +33,7 @@ NEWTON_TOLERANCE = 1e-6
 FAR = 1.0e300
 
 
-@compiled
+@compiled_internal
 def squared_distance(table: Table, closed: bool, x: Float, y: Float, node: int) -> Float:
     """Squared distance of a point from a node, m^2; on a closed path nodes go on over laps."""
     if closed:
@@ -42,7 +42,7 @@ def squared_distance(table: Table, closed: bool, x: Float, y: Float, node: int) 
     return dx * dx + dy * dy
 
 
-@compiled
+@compiled_internal
 def nearest_node(table: Table, closed: bool, x: Float, y: Float, first: int, last: int) -> int:
     """Index of the node nearest to a point, of those from `first` to `last`; of equals the first.
 
@@ -131,7 +131,7 @@ def foot_point(
     return node, u, (dy * tx - dx * ty) / math.sqrt(tx * tx + ty * ty)
 
 
-@compiled
+@compiled_internal
 def searched_nodes(
     n: int, spacing: Float, closed: bool, near: Float, window: Float
 ) -> tuple[int, int]:
@@ -144,7 +144,7 @@ def searched_nodes(
     return max(middle - reach, 0), min(middle + reach, n - 1)
 
 
-@compiled
+@compiled_internal
 def arc_length_in(length: Float, closed: bool, n: int, index: int, u: Float) -> Float:
     """Arc length at u of a cell (counted over laps), m; exactly `length` at an open path's end."""
     if not closed and index == n - 2 and u >= 1.0:

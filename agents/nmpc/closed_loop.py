@@ -5,7 +5,6 @@ in each is bit for bit what `RtiNmpc.predict` and the environment's `step` would
 whatever n is and however many threads share the work.
 """
 
-import os
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -19,6 +18,7 @@ from agents.nmpc.layout import working_space
 from agents.nmpc.program import INNER
 from agents.nmpc.rti_agent import RtiMemory, RtiNmpc
 from lpv_track_env import kernels as k
+from lpv_track_env.threads import checked_threads, using_threads
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories.compilation import compiled, compiled_parallel
 
@@ -64,7 +64,7 @@ class Tally(NamedTuple):
 @compiled
 def drive_rows(
     first: int, last: int, periods: int, memories: Array, observations: Array, ends: Array,
-    cases: Array, env_constants: Array, tables: Array, rows: Array, bound: Array, weights: Array,
+    cases: Array, env_constants: Array, tables: Array, rows: Array, weights: Array,
     constants: Array, plans: Array, flags: Array, told: Array, states: Array, actions: Array,
     progress: Array, given: Array, tally: Array, trace: Array, seen: Array, stages: Array,
     lanes: Array,
@@ -95,11 +95,13 @@ def drive_rows(
                     sums[FAILED] += 1.0
                     break
             before_a, before_delta = memory[k.ACCELERATION], memory[k.STEERING]
-            ends[row] = k.step(
-                memory, actions[row], env_constants[case], table, bound, observations[row]
-            )
+            ends[row] = k.drive(
+                memory, actions[row, 0], actions[row, 1], env_constants[case], table,
+                observations[row],
+            )  # fmt: skip
             if trace.shape[1] > 0:
-                trace[row, progress[row]] = memory
+                for j in range(memory.shape[0]):
+                    trace[row, progress[row], j] = memory[j]
             progress[row] += 1
             change_a = memory[k.ACCELERATION] - before_a
             change_delta = memory[k.STEERING] - before_delta
@@ -120,7 +122,7 @@ def drive_rows(
 @compiled_parallel
 def drive_in_threads(
     chunks: int, n: int, periods: int, memories: Array, observations: Array, ends: Array,
-    cases: Array, env_constants: Array, tables: Array, rows: Array, bound: Array, weights: Array,
+    cases: Array, env_constants: Array, tables: Array, rows: Array, weights: Array,
     constants: Array, plans: Array, flags: Array, told: Array, states: Array, actions: Array,
     progress: Array, given: Array, tally: Array, trace: Array, seen: Array, stages: Array,
     lanes: Array,
@@ -129,7 +131,7 @@ def drive_in_threads(
     for chunk in numba.prange(chunks):
         drive_rows(
             chunk * n // chunks, (chunk + 1) * n // chunks, periods, memories, observations, ends,
-            cases, env_constants, tables, rows, bound, weights, constants, plans, flags, told,
+            cases, env_constants, tables, rows, weights, constants, plans, flags, told,
             states, actions, progress, given, tally, trace, seen[chunk], stages[chunk],
             lanes[chunk],
         )  # fmt: skip
@@ -170,15 +172,10 @@ class ClosedLoop:
                 f"the agent is made for {agent.task.layout}, the environments have "
                 f"{envs.single.layout}: make it with agents.make(name, envs.single)"
             )
-        most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-        if not 1 <= threads <= most:
-            raise ValueError(f"threads must be from 1 to {most}, not {threads}")
         self.envs, self.agent = envs, agent
         n = envs.num_envs
         self.memory = RtiMemory(n, agent.problem.horizon)
-        self._threads = min(threads, n)
-        if self._threads > 1:
-            os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+        self._threads = min(checked_threads(threads), n)
         self._work = (
             np.zeros((self._threads, 1, agent.task.layout.size)),
             *working_space(agent.problem.horizon, self._threads),
@@ -243,20 +240,13 @@ class ClosedLoop:
             if self._threads == 1:
                 drive_rows(0, n, *arguments, *(space[0] for space in self._work))
             else:
-                self._in_threads(n, arguments)
+                with using_threads(self._threads):
+                    drive_in_threads(self._threads, n, *arguments, *self._work)
             stuck = np.flatnonzero((arrays.ends == k.RUNNING) & (progress < periods))
             if stuck.size == 0:
                 return Tally(*tally.T.copy())
             self.agent.replace_failed(arrays.observations.astype(np.float64), memory, stuck)
             given[stuck] = True
-
-    def _in_threads(self, n: int, arguments: tuple[Any, ...]) -> None:
-        before = numba.get_num_threads()
-        numba.set_num_threads(self._threads)
-        try:
-            drive_in_threads(self._threads, n, *arguments, *self._work)  # type: ignore[call-arg]
-        finally:
-            numba.set_num_threads(before)
 
     def _checked_weights(self, weights: ArrayLike | None) -> Array:
         if weights is None:

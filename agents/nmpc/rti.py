@@ -9,6 +9,7 @@ measured, so it is feasible for the dynamics before every program.
 import math
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,7 +59,12 @@ from agents.nmpc.program import (
 )
 from agents.reference import NODE, fill_nodes
 from lpv_track_env.kernels import PREVIEW_START
-from trajectories.compilation import compiled, compiled_in_place, compiled_internal
+from trajectories.compilation import (
+    compiled,
+    compiled_in_place,
+    compiled_internal,
+    compiled_parallel,
+)
 
 Array = NDArray[Any]
 Float = Any
@@ -199,3 +205,19 @@ def control(
         flags[row, AGE], flags[row, FAILURES] = 0, 0
         bound_action(stages[0, NOW_A], stages[0, NOW_DELTA], constants, actions[row])
     return failed
+
+
+@compiled_parallel
+def control_in_threads(
+    chunks: int, observations: Array, weights: Array, constants: Array, plans: Array,
+    flags: Array, told: Array, states: Array, actions: Array, stages: Array, lanes: Array,
+    failed: Array,
+) -> None:  # fmt: skip
+    """`control` of all rows, in chunks that threads share; `failed` (chunks,) gets its results."""
+    n = observations.shape[0]
+    for chunk in numba.prange(chunks):
+        first, last = chunk * n // chunks, (chunk + 1) * n // chunks
+        failed[chunk] = control(
+            first, observations[first:last], weights, constants, plans, flags, told, states,
+            actions, stages[chunk], lanes[chunk],
+        )  # fmt: skip

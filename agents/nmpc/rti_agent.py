@@ -14,6 +14,7 @@ from agents.nmpc.problem import INPUTS, STATES
 from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import TrackingObservation
+from lpv_track_env.threads import checked_threads, using_threads
 from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]
@@ -85,6 +86,8 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         Of the quadratic program.
     max_failures
         Failed solves in a row after which the vehicle is brought to a stop.
+    threads
+        Threads that share a batch of observations, 1 by default. Results do not depend on it.
 
     The public behaviour is that of `lpv-nmpc-ipopt`, its ladder after failed solves included. A
     batch of observations (n, size) is solved in one compiled call.
@@ -108,6 +111,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         damping: tuple[float, float] = DAMPING,
         tolerance: float = 1e-12,
         max_failures: int = 10,
+        threads: int = 1,
     ) -> None:
         super().__init__(
             task,
@@ -122,8 +126,8 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         self.solver = RtiSolver(self.problem, damping=damping, tolerance=tolerance)
         space = slice(layout.SPACE_LOW_A, layout.SPACE_HIGH_DELTA + 1)
         self.solver.constants[space] = [*self._low, *self._high]
-        stages, lanes = layout.working_space(self.problem.horizon, 1)
-        self._stages, self._lanes = stages[0], lanes[0]
+        self._threads = checked_threads(threads)
+        self._work = layout.working_space(self.problem.horizon, self._threads)
         self._memory: RtiMemory | None = None
         self._size = task.layout.size
 
@@ -183,10 +187,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
                 memory.clear(row)
         weights = self._rows if self._schedule is None else self._weights_of(rows, memory)
         began = time.perf_counter()
-        failed = rti.control(
-            0, rows, weights, self.solver.constants, memory.plans, memory.flags, memory.told,
-            memory.states, memory.actions, self._stages, self._lanes,
-        )  # fmt: skip
+        failed = self._control(rows, weights, memory)
         memory.seconds = time.perf_counter() - began
         if memory.ladders or failed:
             self.replace_failed(
@@ -194,6 +195,21 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             )
         actions = memory.actions.astype(np.float32)
         return (actions[0] if single else actions), memory
+
+    def _control(self, rows: Array, weights: Array, memory: RtiMemory) -> int:
+        """Solve for every row; how many solves failed."""
+        stages, lanes = self._work
+        arguments = (
+            rows, weights, self.solver.constants, memory.plans, memory.flags, memory.told,
+            memory.states, memory.actions,
+        )  # fmt: skip
+        chunks = min(self._threads, len(rows))
+        if chunks == 1:
+            return rti.control(0, *arguments, stages[0], lanes[0])
+        failed = np.zeros(chunks, dtype=np.int64)
+        with using_threads(chunks):
+            rti.control_in_threads(chunks, *arguments, stages, lanes, failed)
+        return int(failed.sum())
 
     def _weights_of(self, rows: Array, memory: RtiMemory) -> Array:
         """Weights that the schedule chooses for each row, (n, 10)."""
