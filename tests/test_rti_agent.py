@@ -83,6 +83,28 @@ def test_failures_are_found_in_every_threads_share() -> None:
     ]  # fmt: skip
 
 
+def test_control_of_one_row_of_a_batch_is_predict_of_that_row() -> None:
+    sets = tuple(TrackingWeights(R=(0.01, scale)) for scale in (1.0, 3.0, 9.0, 27.0))
+    schedule = WeightSchedule(CurvatureBands(), sets)
+    rows, together, single = drives(3, 8), made(weights=schedule), made(weights=schedule)
+    unpack = together.task.layout.unpack
+    _, memory = single.predict(rows[0])
+    together.predict(rows[0])
+    for row in rows[1:]:
+        row[1, 5] = np.nan
+        wanted, reached = together.predict(row)
+        for k in range(3):
+            action = single.control(unpack(row[k]), memory[k])
+            np.testing.assert_array_equal(np.float32(action), wanted[k])
+            ours = single.diagnostics(memory[k])
+            assert ours["fallback"] == together.diagnostics(reached[k])["fallback"]
+        assert memory.bands == reached.bands
+        np.testing.assert_array_equal(memory.plans, reached.plans)
+        np.testing.assert_array_equal(memory.flags, reached.flags)
+    assert ours["status"] == "SUCCESS"
+    assert single.diagnostics(memory[1])["status"] == "NAN"
+
+
 @pytest.mark.parametrize("threads", [0, -1, 10_000])
 def test_impossible_threads_are_refused(threads: int) -> None:
     with pytest.raises(ValueError, match=rf"threads must be from 1 to \d+ .*, not {threads}"):

@@ -1,5 +1,6 @@
 """The LPV-NMPC as an agent in real time: `lpv-nmpc`."""
 
+import copy
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -46,6 +47,22 @@ class RtiMemory:
         if not -len(self) <= row < len(self):
             raise IndexError(f"row {row} of {len(self)}")
         return RtiRow(self, row % len(self))
+
+    def take(self, row: int) -> "RtiMemory":
+        """Memory of one row alone, on the same arrays; `put` gives the rest of it back."""
+        alone = copy.copy(self)
+        for name in ("plans", "flags", "told", "states", "actions"):
+            setattr(alone, name, getattr(self, name)[row : row + 1])
+        alone.bands = [self.bands[row]]
+        alone.ladders = {0: self.ladders[row]} if row in self.ladders else {}
+        return alone
+
+    def put(self, row: int, alone: "RtiMemory") -> None:
+        """Take back a row that was given out by `take`."""
+        self.bands[row] = alone.bands[0]
+        if 0 in alone.ladders:
+            self.ladders[row] = alone.ladders[0]
+        self.seconds = alone.seconds * len(self)
 
     def clear(self, row: int) -> None:
         """Forget a row: a new episode begins there."""
@@ -136,10 +153,11 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         return self._weights.reshape(1, -1)
 
     def control(self, observation: TrackingObservation, memory: RtiRow) -> tuple[float, float]:
-        """Inputs for one observation, by `predict`."""
+        """Inputs for one observation, those of `predict`; what it remembers is that row's."""
         flat = np.concatenate([np.ravel(entry) for entry in observation])
-        rows = self._new(1) if len(memory.memory) != 1 else memory.memory
-        action, _ = self.predict(flat, rows)
+        alone = memory.memory.take(memory.row)
+        action, _ = self.predict(flat, alone)
+        memory.memory.put(memory.row, alone)
         return float(action[0]), float(action[1])
 
     def new_memory(self) -> RtiRow:
