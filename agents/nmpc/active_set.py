@@ -19,6 +19,7 @@ from agents.nmpc.layout import (
     BARRIER_VY,
     CHANGE_A,
     CHANGE_DELTA,
+    DLAM,
     FIRST_CHANGE_A,
     FIRST_CHANGE_DELTA,
     FORCE,
@@ -116,6 +117,39 @@ def guess(lanes: Array) -> None:
             lam[i] = 0.0
             found = BINDING if gap[i] < near else FREE
             mode[i] = BROKEN_SOFT if gap[i] < min(near, broken) else found
+
+
+@compiled_internal
+def identify(lanes: Array) -> None:
+    """Guess which constraints bind, or are broken, from the interior-point method's pairs.
+
+    Its multipliers are kept in the rows of their steps: see `recall`.
+    """
+    for k in range(PAIRS):
+        # Hard ones have no slack; each soft constraint's is the third of its pairs.
+        own = k + (2 - (k - 8) % 3) if k >= 8 else k
+        t, lam, mode, kept = lanes[T + k], lanes[LAM + k], lanes[MODE + k], lanes[DLAM + k]
+        slack, force = lanes[T + own], lanes[LAM + own]
+        for i in range(lanes.shape[1]):
+            kept[i] = lam[i]
+            found = FREE
+            if lam[i] > t[i]:
+                found = BROKEN_SOFT if k >= 8 and slack[i] > force[i] else BINDING
+            mode[i] = found if not is_slack(k) else FREE
+    for k in range(PAIRS):
+        mode, lam = lanes[MODE + k], lanes[LAM + k]
+        for i in range(lanes.shape[1]):
+            if mode[i] != BINDING:
+                lam[i] = 0.0
+
+
+@compiled_internal
+def recall(lanes: Array) -> None:
+    """Give the interior-point method its multipliers back."""
+    for k in range(PAIRS):
+        lam, kept = lanes[LAM + k], lanes[DLAM + k]
+        for i in range(lanes.shape[1]):
+            lam[i] = kept[i]
 
 
 @compiled_internal

@@ -3,7 +3,7 @@
 `constants` (CONSTANTS_SIZE,) are those of a solver: model, discretisation, limits and prices.
 `stages` (N + 1, STAGE) has everything about a stage side by side, for the recursions: a record of
 the model's derivatives (`linearisation`), gains (`riccati`), three points in the order a, delta,
-vx, vy, psi, r, X, Y, and the reference. The last stage has a state only.
+vx, vy, psi, r, X, Y, the reference, and one more point. The last stage has a state only.
 `lanes` (LANES, N) has one quantity of all stages side by side, for loops over the inequalities, of
 which a processor takes several stages at a time. Every inequality is a pair (t, lam) with
 t lam -> 0, PAIRS to a stage; with "gap" for the distance to a bound::
@@ -46,9 +46,11 @@ STEP_A, STEP_DELTA, STEP_VX, STEP_VY, STEP_PSI, STEP_R, STEP_X, STEP_Y = range(5
 NOW_A, NOW_DELTA, NOW_VX, NOW_VY, NOW_PSI, NOW_R, NOW_X, NOW_Y = range(66, 74)
 PLAN_A, PLAN_DELTA, PLAN_VX, PLAN_VY, PLAN_PSI, PLAN_R, PLAN_X, PLAN_Y = range(74, 82)
 POINT = 8
-# and the reference: a node of `agents.reference`.
+# the reference: a node of `agents.reference`, of which the first four are read;
 REFERENCE, REFERENCE_HEADING, REFERENCE_X, REFERENCE_Y = range(82, 86)
-STAGE = 88
+# and a solution kept while another is tried.
+KEPT = 87
+STAGE = 96
 """Rounded up to whole cache lines."""
 SENSITIVITY = RECORD
 """Scratch of `linearisation`, 30 numbers, where gains and step come later."""

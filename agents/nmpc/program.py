@@ -11,7 +11,16 @@ from typing import Any
 from numpy.typing import NDArray
 
 from agents.nmpc import riccati
-from agents.nmpc.active_set import HELD, guess, hold, measure_gaps, revise, take_slacks
+from agents.nmpc.active_set import (
+    HELD,
+    guess,
+    hold,
+    identify,
+    measure_gaps,
+    recall,
+    revise,
+    take_slacks,
+)
 from agents.nmpc.interior_point import START_BARRIER, centre, expand, press, start, update, weigh
 from agents.nmpc.layout import (
     CHANGE_A,
@@ -19,6 +28,7 @@ from agents.nmpc.layout import (
     FIRST_CHANGE_A,
     FIRST_CHANGE_DELTA,
     HIGH_A,
+    KEPT,
     LOW_A,
     MAX_DELTA,
     NOW_A,
@@ -58,8 +68,11 @@ TOLD = 7
 
 GUESSING, PREDICTING, CORRECTING = 0, 1, 2
 """Phases: guesses, then predictor and corrector in turns."""
-MAX_GUESSES = 6
+MAX_GUESSES, MAX_CROSSINGS = 6, 4
+"""Turns of guesses, at first and from what the interior-point method has found."""
 MAX_ITERATIONS = 40
+CROSSING, NEXT_CROSSING = 1e-6, 1e-3
+"""Mean product t lam at which that is tried."""
 CAUTION, LEAST_CAUTION = 0.995, 0.9999
 """Share of the way to the nearest bound, at first and near the solution."""
 ACCEPTABLE = 1e-6
@@ -98,6 +111,22 @@ def follow(stages: Array) -> None:
         f[NOW_Y] += e[HEADING_Y] * turn + (e[NOW_Y] - e[PLAN_Y])
 
 
+@compiled_internal
+def take(stages: Array, to: int, at: int) -> None:
+    """Copy a point of all stages, from column `at` on."""
+    for i in range(stages.shape[0]):
+        for k in range(POINT):
+            stages[i, to + k] = stages[i, at + k]
+
+
+@compiled_internal
+def advance(stages: Array, length: Float) -> None:
+    """Move the solution so far by `length` times the step."""
+    for i in range(stages.shape[0]):
+        for k in range(POINT):
+            stages[i, NOW_A + k] += length * stages[i, STEP_A + k]
+
+
 @compiled_in_place
 def solve_program(
     stages: Array, lanes: Array, last_a: Float, last_delta: Float, weights: Array,
@@ -111,20 +140,26 @@ def solve_program(
     n = lanes.shape[1]
     for i in range(n):
         differentiate(stages[i], constants, stages[i + 1])
-    for i in range(n + 1):
-        for k in range(POINT):
-            stages[i, NOW_A + k] = stages[i, PLAN_A + k]
+    take(stages, NOW_A, PLAN_A)
     measure_gaps(stages, lanes, last_a, last_delta, constants)
     guess(lanes)
     mu, worst, share, tolerance = START_BARRIER, 0.0, 1.0, constants[TOLERANCE]
-    phase, tries, iterations, code, changed = GUESSING, 0, 0, UNDECIDED, True
+    phase, tries, most, iterations = GUESSING, 0, MAX_GUESSES, 0
+    code, changed, inside, crossing = UNDECIDED, True, False, CROSSING
     # All methods take turns through one loop: each part is called from one place only, which
     # halves the time that compiling takes.
-    while code == UNDECIDED:
+    while True:
         if phase == GUESSING:
             hold(lanes, constants)
         else:
             if phase == PREDICTING:
+                largest = max(mu, share * worst)
+                if largest <= tolerance:
+                    code = SUCCESS
+                    break
+                if iterations >= MAX_ITERATIONS:
+                    code = SUCCESS if largest <= ACCEPTABLE else MAXITER
+                    break
                 weigh(lanes, constants)
             press(lanes, constants, share)
         if phase == PREDICTING or (phase == GUESSING and changed):
@@ -140,39 +175,50 @@ def solve_program(
         total = 0.0
         for i in range(n):
             total += stages[i, STEP_A] + stages[i, STEP_DELTA] + stages[i + 1, STEP_X]
-        if not math.isfinite(total):
-            good = phase == CORRECTING and mu <= ACCEPTABLE and share * worst <= ACCEPTABLE
-            code = SUCCESS if good else QP_FAILURE
-            break
+        finite = math.isfinite(total)
         if phase == CORRECTING:
+            if not finite:
+                code = SUCCESS if max(mu, share * worst) <= ACCEPTABLE else QP_FAILURE
+                break
             length = min(1.0, max(CAUTION, min(1.0 - mu, LEAST_CAUTION)) * length)
             mu = update(lanes, length)
             share *= 1.0 - length
-        for i in range(n + 1):
-            for k in range(POINT):
-                stages[i, NOW_A + k] += length * stages[i, STEP_A + k]
+        if finite:
+            advance(stages, length)
         iterations += 1
+        near = max(mu, share * worst) <= crossing or iterations >= MAX_ITERATIONS
+        if phase == GUESSING or near:
+            measure_gaps(stages, lanes, last_a, last_delta, constants)
         if phase == CORRECTING:
             phase = PREDICTING
-            if mu <= tolerance and share * worst <= tolerance:
-                code = SUCCESS
-            elif iterations >= MAX_ITERATIONS:
-                good = mu <= ACCEPTABLE and share * worst <= ACCEPTABLE
-                code = SUCCESS if good else MAXITER
+            if near:
+                # From inside to the edge: which bind can be told by now.
+                take(stages, KEPT, NOW_A)
+                identify(lanes)
+                phase, tries, most, changed = GUESSING, 0, MAX_CROSSINGS, True
+                crossing *= NEXT_CROSSING
             continue
         tries += 1
-        measure_gaps(stages, lanes, last_a, last_delta, constants)
-        changed, off = revise(lanes, constants)
+        off = math.inf
+        if finite:
+            changed, off = revise(lanes, constants)
         if not changed and off <= HELD:
             take_slacks(lanes)
             code = SUCCESS
-        elif tries == MAX_GUESSES:
+            break
+        if tries < most and finite:
+            continue
+        phase = PREDICTING
+        if inside:
+            take(stages, NOW_A, KEPT)
+            recall(lanes)
+        else:
             # Start the interior-point method where all inputs keep their limits.
+            inside = True
             clamp(stages, NOW_A, last_a, last_delta, constants)
             follow(stages)
             measure_gaps(stages, lanes, last_a, last_delta, constants)
             worst = start(lanes, constants)
-            phase = PREDICTING
     clamp(stages, NOW_A, last_a, last_delta, constants)
     told[INNER] += iterations
     told[OUTER] += 1.0

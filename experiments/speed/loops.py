@@ -6,7 +6,7 @@ import numpy as np
 
 import agents
 from agents.nmpc.closed_loop import ClosedLoop
-from experiments.speed.measure import Effort, Run, Section, Tick, calibrated, interleave
+from experiments.speed.measure import Effort, Section, Tick, calibrated, interleave
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 
 PERIODS = 20
@@ -33,7 +33,9 @@ def loops(section: Section, effort: Effort, tick: Tick) -> None:
             tick(f"closed loops: {n} environments, {threads} threads")
             series = section.add("closed loop", "s/period", n=n, threads=threads)
             loop = closed_loop(effort.trajectories, n, threads)
-            pairs.append((series, calibrated(loop_run(loop), effort.round_seconds)))
+            run = Driving(loop)
+            once = calibrated(run, effort.round_seconds)
+            pairs.append((series, lambda run=run, once=once: once() / run.periods))
         interleave(pairs, effort.rounds)
         for series, _ in pairs[1:]:
             section.compare(series, pairs[0][0])
@@ -49,19 +51,24 @@ def closed_loop(trajectories: tuple[str, ...], n: int, threads: int) -> ClosedLo
     return ClosedLoop(envs, agent, threads=threads)  # type: ignore[arg-type]
 
 
-def loop_run(loop: ClosedLoop) -> Run:
-    """Calls of `drive` on episodes that begin anew each time; seconds per period driven."""
-    n = loop.envs.num_envs
-    spread = np.random.default_rng(0).normal(0.0, SPREAD, (n, 10))
-    weights = loop.agent.fixed_weights * np.exp(spread)
+class Driving:
+    """Calls of `drive` on episodes that begin anew each time."""
 
-    def run(count: int) -> float:
-        seconds = 0.0
+    def __init__(self, loop: ClosedLoop) -> None:
+        n = loop.envs.num_envs
+        spread = np.random.default_rng(0).normal(0.0, SPREAD, (n, 10))
+        self.loop, self.weights = loop, loop.agent.fixed_weights * np.exp(spread)
+        self.periods = 1.0
+        """Control periods that a call of the last round drove, all environments together."""
+
+    def __call__(self, count: int) -> float:
+        """Seconds of `count` calls."""
+        seconds = driven = 0.0
         for k in range(count):
-            loop.reset(seed=k * n)
+            self.loop.reset(seed=k * self.loop.envs.num_envs)
             began = time.perf_counter()
-            tally = loop.drive(PERIODS, weights)
-            seconds += (time.perf_counter() - began) / max(float(tally.steps.sum()), 1.0)
+            tally = self.loop.drive(PERIODS, self.weights)
+            seconds += time.perf_counter() - began
+            driven += float(tally.steps.sum())
+        self.periods = driven / count
         return seconds
-
-    return run
