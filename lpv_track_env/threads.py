@@ -29,12 +29,22 @@ def checked_threads(value: int) -> int:
     return threads
 
 
+SHARES = 8
+"""Shares of the work to a thread: a share may be harder than another, or a processor be taken."""
+
+
+def shares(threads: int) -> int:
+    """Into how many shares threads divide their work, if there is enough of it."""
+    return SHARES * threads if threads > 1 else 1
+
+
 @contextmanager
 def using_threads(threads: int) -> Iterator[None]:
-    """Have numba's parallel loops use so many threads."""
+    """Have numba's parallel loops use so many threads, each taking the next share when it can."""
     before = numba.get_num_threads()
     numba.set_num_threads(threads)
     try:
-        yield
+        with numba.parallel_chunksize(1):
+            yield
     finally:
         numba.set_num_threads(before)

@@ -17,7 +17,7 @@ from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.episodes import GIVEN, given_start, random_key
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task, action_space, choose
-from lpv_track_env.threads import checked_threads, using_threads
+from lpv_track_env.threads import checked_threads, shares, using_threads
 from lpv_track_env.vector_infos import episode_infos, final_infos
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
@@ -164,7 +164,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._final_memories = np.zeros((n, kernels.MEMORY_SIZE))
         self._observations = np.zeros((n, size), dtype=np.float32)
         self._final_observations = np.zeros((n, size), dtype=np.float32)
-        self._scratch = np.zeros((self._threads, vector_kernels.SCRATCH_SIZE))
+        self._scratch = np.zeros((shares(self._threads), vector_kernels.SCRATCH_SIZE))
         self._cases = np.zeros(n, dtype=np.int64)
         self._keys = np.zeros(n, dtype=np.uint64)
         self._episodes = np.full(n, -1)
@@ -311,7 +311,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             vector_kernels.advance(0, n, *arguments, self._scratch[0])
         else:
             with using_threads(self._threads):
-                vector_kernels.advance_in_threads(self._threads, n, *arguments, self._scratch)
+                chunks = len(self._scratch)
+                vector_kernels.advance_in_threads(chunks, n, *arguments, self._scratch)
         ended = self._ends != kernels.RUNNING
         truncated = self._ends == kernels.TIME_LIMIT
         # A copy: a reset of some environments hands out the others' observations again.

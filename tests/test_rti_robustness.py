@@ -14,8 +14,8 @@ from agents.weights import TrackingWeights
 from lpv_track_env.vehicle import VEHICLES
 
 Array = NDArray[Any]
-MAX_ITERATIONS = 40
-"""Of the interior-point method, after the tries of the active-set method that count as well."""
+MAX_ITERATIONS = 44
+"""Turns of both methods, with a last try to end in a guess."""
 
 
 def wild_observations(rng: np.random.Generator, count: int, steps: int) -> Array:
@@ -65,7 +65,7 @@ def test_wild_observations(vehicle: str) -> None:
                 statuses[status.value] += 1
     solvable = statuses.total() - statuses["NAN"]
     assert statuses["NAN"] > 0.03 * statuses.total()
-    assert statuses["SUCCESS"] > 0.95 * solvable, statuses
+    assert statuses["SUCCESS"] > 0.999 * solvable, statuses
 
 
 def test_nothing_of_a_wild_batch_stays_in_the_solver() -> None:

@@ -18,7 +18,7 @@ from agents.nmpc.layout import working_space
 from agents.nmpc.program import INNER
 from agents.nmpc.rti_agent import RtiMemory, RtiNmpc
 from lpv_track_env import kernels as k
-from lpv_track_env.threads import checked_threads, using_threads
+from lpv_track_env.threads import checked_threads, shares, using_threads
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories.compilation import compiled, compiled_parallel
 
@@ -177,8 +177,8 @@ class ClosedLoop:
         self.memory = RtiMemory(n, agent.problem.horizon)
         self._threads = min(checked_threads(threads), n)
         self._work = (
-            np.zeros((self._threads, 1, agent.task.layout.size)),
-            *working_space(agent.problem.horizon, self._threads),
+            np.zeros((shares(self._threads), 1, agent.task.layout.size)),
+            *working_space(agent.problem.horizon, shares(self._threads)),
         )
 
     def reset(
@@ -241,7 +241,7 @@ class ClosedLoop:
                 drive_rows(0, n, *arguments, *(space[0] for space in self._work))
             else:
                 with using_threads(self._threads):
-                    drive_in_threads(self._threads, n, *arguments, *self._work)
+                    drive_in_threads(min(len(self._work[0]), n), n, *arguments, *self._work)
             stuck = np.flatnonzero((arrays.ends == k.RUNNING) & (progress < periods))
             if stuck.size == 0:
                 return Tally(*tally.T.copy())

@@ -15,7 +15,7 @@ from agents.nmpc.problem import INPUTS, STATES
 from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import TrackingObservation
-from lpv_track_env.threads import checked_threads, using_threads
+from lpv_track_env.threads import checked_threads, shares, using_threads
 from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]
@@ -144,7 +144,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         space = slice(layout.SPACE_LOW_A, layout.SPACE_HIGH_DELTA + 1)
         self.solver.constants[space] = [*self._low, *self._high]
         self._threads = checked_threads(threads)
-        self._work = layout.working_space(self.problem.horizon, self._threads)
+        self._work = layout.working_space(self.problem.horizon, shares(self._threads))
         self._memory: RtiMemory | None = None
         self._size = task.layout.size
 
@@ -221,11 +221,11 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             rows, weights, self.solver.constants, memory.plans, memory.flags, memory.told,
             memory.states, memory.actions,
         )  # fmt: skip
-        chunks = min(self._threads, len(rows))
+        chunks = min(len(stages), len(rows))
         if chunks == 1:
             return rti.control(0, *arguments, stages[0], lanes[0])
         failed = np.zeros(chunks, dtype=np.int64)
-        with using_threads(chunks):
+        with using_threads(self._threads):
             rti.control_in_threads(chunks, *arguments, stages, lanes, failed)
         return int(failed.sum())
 
