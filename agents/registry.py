@@ -18,6 +18,7 @@ from agents.base import Agent, DrivingTask
 REGISTRY: dict[str, str] = {
     "lpv-nmpc": "agents.nmpc.rti_agent:RtiNmpc",
     "lpv-nmpc-ipopt": "agents.nmpc.agent:IpoptNmpc",
+    "lpv-mpc-frozen": "agents.nmpc.frozen:FrozenLpvMpc",
     "stanley": "agents.geometric:Stanley",
     "pure-pursuit": "agents.geometric:PurePursuit",
     "lqr": "agents.lqr:LpvLqr",

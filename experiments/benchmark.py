@@ -19,6 +19,7 @@ from rich.progress import (
 
 from experiments import engines
 from experiments.cases import Case
+from experiments.interrupts import Interrupts
 from experiments.report import write_report
 from experiments.results import ResultStore
 from experiments.tables import console_table
@@ -97,7 +98,7 @@ def _run(specs: Sequence[Spec], store: ResultStore, workers: int, console: Conso
     workers = min(workers, len(specs))
     progress = progress_bar(console)
     began = time.perf_counter()
-    with progress:
+    with progress, Interrupts() as interrupts:
         bar = progress.add_task("cases", total=len(specs))
 
         def started(spec: Spec) -> None:
@@ -109,6 +110,8 @@ def _run(specs: Sequence[Spec], store: ResultStore, workers: int, console: Conso
             else engines.local_pool(specs, workers, started=started)
         )
         for count, result in enumerate(run, start=1):
+            # First, for a case may have taken it for a failed solve.
+            interrupts.check()
             store.append(result)
             progress.advance(bar)
             if not console.is_terminal:

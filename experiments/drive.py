@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from experiments.cases import Case
+from experiments.interrupts import Interrupts
 from experiments.rollout import rollout
 from lpv_track_env.bicycle import PSI, X, Y
 
@@ -52,6 +53,7 @@ def drive(case: Case, console: Console, *, frames: Path | None = None, every: in
 
     def show(step: int, info: dict[str, Any]) -> None:
         nonlocal count
+        interrupts.check()
         inner.show_plan(world_plan(info))
         if frames is not None and step % every == 0:
             save(inner.render(), frames / f"frame-{step:06d}.png")
@@ -63,7 +65,8 @@ def drive(case: Case, console: Console, *, frames: Path | None = None, every: in
         inner.render()
     except RuntimeError as error:
         raise ValueError(str(error)) from error
-    done = rollout(env, agent, seed=case.seed, on_step=show)
+    with Interrupts() as interrupts:
+        done = rollout(env, agent, seed=case.seed, on_step=show)
     worst = float(np.abs(done.trace.lateral_error).max())
     where = "" if frames is None else f"; {count} frames in {frames}"
     console.print(

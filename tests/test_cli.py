@@ -128,7 +128,8 @@ def test_two_workers_give_what_one_gives(small: Path, tmp_path: Path) -> None:
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    # Where nothing is in numba's cache yet, workers say that they compile.
+    assert not [line for line in done.stderr.splitlines() if "compiling" not in line]
     assert str(tmp_path / "two" / "report.html") in done.stdout
     assert outcome(tmp_path / "two") == outcome(small)
 
@@ -230,6 +231,37 @@ def test_ctrl_c_ends_with_130_and_one_line(tmp_path: Path) -> None:
     assert "--resume" in out
     assert "Traceback" not in out + err
     wait_until(lambda: not any(map(runs, workers)))
+
+
+@pytest.mark.parametrize("command", ["benchmark", "drive"])
+def test_ctrl_c_that_a_solver_takes_for_its_own_failure_counts(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As CasADi does. A case that went on with such a failure is not a result."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    agent = tmp_path / "swallowing.py"
+    agent.write_text(
+        "import os, signal\n"
+        "from agents.geometric import Stanley\n"
+        "class Swallowing(Stanley):\n"
+        "    def control(self, observation, memory):\n"
+        "        try:\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "        except KeyboardInterrupt:\n"
+        "            pass\n"
+        "        return super().control(observation, memory)\n"
+    )
+    out = tmp_path / "out"
+    arguments = {
+        "benchmark": ["--agents", f"{agent}:Swallowing", "--trajectories", "u-turn",
+                      "--workers", "1", "--out", str(out)],
+        "drive": ["--agent", f"{agent}:Swallowing", "--trajectory", "u-turn",
+                  "--frames", str(tmp_path / "frames"), "--every", "1000"],
+    }  # fmt: skip
+    before = signal.getsignal(signal.SIGINT)
+    assert main([command, *arguments[command]]) == 130
+    assert signal.getsignal(signal.SIGINT) is before
+    assert not ResultStore(out).cases()
 
 
 def test_report_is_rebuilt_from_saved_cases_alone(

@@ -118,12 +118,39 @@ def test_bad_weights_are_refused_and_nothing_moves(weights: Any, message: str) -
     np.testing.assert_array_equal(loop.envs.memories, before)
 
 
-@pytest.mark.parametrize("shape", [(3, 4, k.MEMORY_SIZE), (2, 5, k.MEMORY_SIZE), (3, 5), (3, 5, 6)])
-def test_a_trace_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+def read_only() -> np.ndarray:
+    array = np.zeros((3, 5, k.MEMORY_SIZE))
+    array.flags.writeable = False
+    return array
+
+
+@pytest.mark.parametrize(
+    "trace",
+    [
+        np.zeros((3, 4, k.MEMORY_SIZE)),
+        np.zeros((2, 5, k.MEMORY_SIZE)),
+        np.zeros((3, 5)),
+        np.zeros((3, 5, 6)),
+        np.zeros((3, 5, k.MEMORY_SIZE), dtype=np.float32),
+        np.zeros((k.MEMORY_SIZE, 5, 3)).T,
+        read_only(),
+    ],
+)
+def test_a_trace_of_another_kind_is_refused(trace: np.ndarray) -> None:
     loop = loop_of(3, CALM)
     loop.reset(seed=0)
-    with pytest.raises(ValueError, match=r"trace must have shape \(3, 5, 24\)"):
-        loop.drive(5, trace=np.zeros(shape))
+    with pytest.raises(ValueError, match=r"trace must be a writable C-ordered .* \(3, 5, 24\)"):
+        loop.drive(5, trace=trace)
+
+
+@pytest.mark.parametrize("periods", [0, -3])
+def test_less_than_one_period_is_refused(periods: int) -> None:
+    loop = loop_of(2, CALM)
+    loop.reset(seed=0)
+    with pytest.raises(ValueError, match=f"periods must be at least 1, not {periods}"):
+        loop.drive(periods)
+    with pytest.raises(TypeError):
+        loop.drive(2.5)  # type: ignore[arg-type]
 
 
 def test_a_drive_before_the_first_reset_is_refused() -> None:

@@ -1,7 +1,7 @@
 """The LPV-NMPC as an agent, solved to convergence: the reference for what is fast."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,74 +38,25 @@ class NmpcMemory:
     solution: Solution | None = None
 
 
-class IpoptNmpc(NmpcAgent[NmpcMemory]):
-    """The LPV-NMPC of kumar2025lpv, solved to convergence by IPOPT through CasADi.
+class Solver(Protocol):
+    """What solves the problem for one vehicle."""
 
-    Parameters
-    ----------
-    task
-        What is driven.
-    horizon
-        N, at most the observation's preview steps (the default).
-    weights
-        Fixed weights, or a schedule.
-    selection
-        How a schedule chooses: "band" from the sharpest curvature in the preview at every step, or
-        "path" once from the path's sharpest curvature, the paper's rule.
-    model
-        The prediction model and its constraints, by default the task's own vehicle.
-    linear_penalty, quadratic_penalty
-        Prices of slack on (vx, vy, vx'), see `NmpcProblem`.
-    tolerance, max_seconds
-        The solver's tolerance, and IPOPT's limit on one solve, s. The default is far above any
-        solve, which 100 iterations bound: results must not depend on how busy the machine is. Lower
-        it to drive by the clock. fatrop has no limit but 200 iterations.
-    solver
-        "ipopt", or "fatrop" where CasADi was built with it: the same problem, exact as well, its
-        stages exploited.
-    max_failures
-        Failed solves in a row after which the vehicle is brought to a stop.
+    def solve(
+        self, state: Array, last_input: Array, reference: Array, weights: Array, warm: Any = None
+    ) -> tuple[Solution, Any]:
+        """Solve; what comes back beside the solution is handed to the next call as `warm`."""
+        ...
+
+
+class SolvedNmpc(NmpcAgent[NmpcMemory]):
+    """An NMPC on any solver of its problem, one vehicle at a time.
 
     A failed solve is replaced by, in this order: the last plan's next input; once that plan is
     used up, Stanley's controller on the same observation; after `max_failures` in a row, braking
     with Stanley's steering. Each is counted in `diagnostics`.
-
-    Raises
-    ------
-    ValueError
-        If the horizon is longer than the preview, or a setting is out of range.
     """
 
-    def __init__(
-        self,
-        task: DrivingTask,
-        *,
-        horizon: int | None = None,
-        weights: TrackingWeights | WeightSchedule | None = None,
-        selection: str = "band",
-        model: VehicleParameters | None = None,
-        linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),
-        quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0),
-        tolerance: float = 1e-6,
-        max_seconds: float = 20.0,
-        max_failures: int = 10,
-        solver: str = "ipopt",
-    ) -> None:
-        super().__init__(
-            task,
-            horizon=horizon,
-            weights=weights,
-            selection=selection,
-            model=model,
-            linear_penalty=linear_penalty,
-            quadratic_penalty=quadratic_penalty,
-            max_failures=max_failures,
-        )
-        self.solver: CasadiSolver | FatropSolver
-        if choose("solver", solver, SOLVERS) == "fatrop":
-            self.solver = FatropSolver(self.problem, tolerance=tolerance)
-        else:
-            self.solver = CasadiSolver(self.problem, tolerance=tolerance, max_seconds=max_seconds)
+    solver: Solver
 
     def new_memory(self) -> NmpcMemory:
         """Nothing solved yet."""
@@ -162,3 +113,69 @@ class IpoptNmpc(NmpcAgent[NmpcMemory]):
             "fallback": memory.ladder.fallback,
             "plan": None if solution.states is None else solution.states[:, 4:],
         }
+
+
+class IpoptNmpc(SolvedNmpc):
+    """The LPV-NMPC of kumar2025lpv, solved to convergence by IPOPT through CasADi.
+
+    Parameters
+    ----------
+    task
+        What is driven.
+    horizon
+        N, at most the observation's preview steps (the default).
+    weights
+        Fixed weights, or a schedule.
+    selection
+        How a schedule chooses: "band" from the sharpest curvature in the preview at every step, or
+        "path" once from the path's sharpest curvature, the paper's rule.
+    model
+        The prediction model and its constraints, by default the task's own vehicle.
+    linear_penalty, quadratic_penalty
+        Prices of slack on (vx, vy, vx'), see `NmpcProblem`.
+    tolerance, max_seconds
+        The solver's tolerance, and IPOPT's limit on one solve, s. The default is far above any
+        solve, which 100 iterations bound: results must not depend on how busy the machine is. Lower
+        it to drive by the clock. fatrop has no limit but 200 iterations.
+    solver
+        "ipopt", or "fatrop" where CasADi was built with it: the same problem, exact as well, its
+        stages exploited.
+    max_failures
+        Failed solves in a row after which the vehicle is brought to a stop.
+
+    Raises
+    ------
+    ValueError
+        If the horizon is longer than the preview, or a setting is out of range.
+    """
+
+    def __init__(
+        self,
+        task: DrivingTask,
+        *,
+        horizon: int | None = None,
+        weights: TrackingWeights | WeightSchedule | None = None,
+        selection: str = "band",
+        model: VehicleParameters | None = None,
+        linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),
+        quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0),
+        tolerance: float = 1e-6,
+        max_seconds: float = 20.0,
+        max_failures: int = 10,
+        solver: str = "ipopt",
+    ) -> None:
+        super().__init__(
+            task,
+            horizon=horizon,
+            weights=weights,
+            selection=selection,
+            model=model,
+            linear_penalty=linear_penalty,
+            quadratic_penalty=quadratic_penalty,
+            max_failures=max_failures,
+        )
+        self.solver: Solver
+        if choose("solver", solver, SOLVERS) == "fatrop":
+            self.solver = FatropSolver(self.problem, tolerance=tolerance)
+        else:
+            self.solver = CasadiSolver(self.problem, tolerance=tolerance, max_seconds=max_seconds)

@@ -5,6 +5,7 @@ in each is bit for bit what `RtiNmpc.predict` and the environment's `step` would
 whatever n is and however many threads share the work.
 """
 
+import operator
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -216,17 +217,25 @@ class ClosedLoop:
         Raises
         ------
         ValueError
-            For weights of a wrong shape or value, or an array to trace into of a wrong shape.
+            For weights of a wrong shape or value, less than one period, or an array to trace into
+            of a wrong kind.
         """
-        n = self.envs.num_envs
+        n, periods = self.envs.num_envs, operator.index(periods)
+        if periods < 1:
+            raise ValueError(f"periods must be at least 1, not {periods}")
         if not self.envs.begun:
             raise gymnasium.error.ResetNeeded("the episodes have not begun: call reset() first")
         sets = self._checked_weights(weights)
         if trace is None:
             trace = np.empty((n, 0, k.MEMORY_SIZE))
-        elif trace.shape != (n, periods, k.MEMORY_SIZE):
+        elif (
+            trace.shape != (n, periods, k.MEMORY_SIZE)
+            or trace.dtype != np.float64
+            or not (trace.flags.c_contiguous and trace.flags.writeable)
+        ):
             raise ValueError(
-                f"trace must have shape {(n, periods, k.MEMORY_SIZE)}, not {trace.shape}"
+                f"trace must be a writable C-ordered float64 array "
+                f"{(n, periods, k.MEMORY_SIZE)}, not {trace.dtype} {trace.shape}"
             )
         progress, given = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.bool_)
         tally = np.zeros((n, TALLY))

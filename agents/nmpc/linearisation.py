@@ -231,3 +231,19 @@ def unpacked(stages: Array) -> Linearisation:
     return Linearisation(
         states.copy(), a_matrices, b_matrices, records[:, RATE].copy(), rate_x, rate_u
     )
+
+
+def pack(model: Linearisation, inputs: Array, stages: Array) -> None:
+    """Put a linear model along `inputs` (N, 2) into stages: the inverse of `unpacked`.
+
+    Entries of A and B that a record does not hold are taken to be those that it implies.
+    """
+    stages[:, PLAN_VX : PLAN_Y + 1] = model.states
+    stages[:-1, PLAN_A : PLAN_DELTA + 1] = inputs
+    for k, column in enumerate(DYNAMIC):
+        stages[:-1, 6 * k : 6 * k + 6] = model.A[:, :, column]
+        stages[:-1, RATE_VX + k] = model.rate_x[:, column]
+    stages[:-1, HEADING_X], stages[:-1, HEADING_Y] = model.A[:, X, PSI], model.A[:, Y, PSI]
+    for k in range(2):
+        stages[:-1, 20 + 6 * k : 26 + 6 * k] = model.B[:, :, k]
+    stages[:-1, RATE], stages[:-1, RATE_DELTA] = model.rate, model.rate_u[:, 1]

@@ -1,8 +1,9 @@
 """The NMPC's quadratic program, compiled: guesses first, the interior-point method if they fail.
 
-The program is the problem linearised along a plan. The plan without inequalities is tried first,
-then a few guesses about which bind (`active_set`); most programs end there, exact to rounding. The
-others go on with `interior_point`. Arrays are those of `layout`.
+The program is the problem linearised along a plan. A few guesses are made about which inequalities
+bind (`active_set`); most programs end there, exact to rounding. The others go on with
+`interior_point`, and from what it has found, a guess is made again: where that stands, the solution
+is exact too. Arrays are those of `layout`.
 """
 
 import math
@@ -53,7 +54,7 @@ from agents.nmpc.layout import (
     STEP_X,
     TOLERANCE,
 )
-from agents.nmpc.linearisation import HEADING_X, HEADING_Y, differentiate
+from agents.nmpc.linearisation import HEADING_X, HEADING_Y
 from trajectories.compilation import compiled_in_place, compiled_internal
 
 Array = NDArray[Any]
@@ -132,14 +133,12 @@ def solve_program(
     stages: Array, lanes: Array, last_a: Float, last_delta: Float, weights: Array,
     constants: Array, told: Array,
 ) -> int:  # fmt: skip
-    """Linearise along the plan of `stages`, rolled out from its first state; solve the program.
+    """Solve the program linearised along the plan of `stages`, by their records.
 
     (last_a, last_delta) is the input in force, `weights` (10,) are Q, S, R. The solution is the
     stages' NOW and, in the lanes, the slacks. Returns a code; adds to `told` (TOLD,).
     """
     n = lanes.shape[1]
-    for i in range(n):
-        differentiate(stages[i], constants, stages[i + 1])
     take(stages, NOW_A, PLAN_A)
     measure_gaps(stages, lanes, last_a, last_delta, constants)
     guess(lanes)

@@ -45,6 +45,7 @@ from agents.nmpc.layout import (
     SPACE_LOW_A,
     SPACE_LOW_DELTA,
 )
+from agents.nmpc.linearisation import differentiate
 from agents.nmpc.program import (
     CODE,
     COST,
@@ -112,6 +113,8 @@ def solve(
     """
     told[INNER] = told[OUTER] = 0.0
     clamp(stages, PLAN_A, last_a, last_delta, constants)
+    for i in range(lanes.shape[1]):
+        differentiate(stages[i], constants, stages[i + 1])
     code = solve_program(stages, lanes, last_a, last_delta, weights, constants, told)
     told[COST] = cost_of(stages, lanes, NOW_A, weights, constants) if code == SUCCESS else math.nan
     for soft in range(3):

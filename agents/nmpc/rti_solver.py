@@ -156,7 +156,7 @@ class RtiSolver:
             status,
             plan,
             self._stages[:, found : found + STATES].copy(),
-            self._lanes[np.array(layout.SLACKS)[list(layout.SLACK_OF)]].T.copy(),
+            self._slack(),
             cost,
             iterations,
             seconds,
@@ -188,11 +188,42 @@ class RtiSolver:
     ) -> tuple[Status, Array]:
         """Solve the program linearised along the roll-out of `inputs` (N, 2); its inputs."""
         self._prepare(state, inputs, reference)
+        linearisation.differentiate_along(self._stages, self.constants)
+        status = self._solve_program(last_input, weights)
+        return status, self._inputs()
+
+    def solve_model(
+        self, model: Linearisation, last_input: Array, reference: Array, weights: Array,
+        inputs: Array,
+    ) -> Solution:  # fmt: skip
+        """Solve the program of a linear model along `inputs` (N, 2): x' = states + A dx + B du."""
+        began = time.perf_counter()
+        linearisation.pack(model, inputs, self._stages)
+        self._stages[:, layout.REFERENCE : layout.REFERENCE_Y + 1] = reference
+        self._told[:] = 0.0
+        status = self._solve_program(last_input, weights)
+        turns = int(self._told[program.INNER])
+        seconds = time.perf_counter() - began
+        if status is not Status.SUCCESS:
+            return Solution(status, None, None, None, np.nan, turns, seconds)
+        cost = rti.cost_of(self._stages, self._lanes, layout.NOW_A, weights, self.constants)
+        return Solution(
+            status, self._inputs(), self._stages[:, layout.NOW_VX : layout.NOW_Y + 1].copy(),
+            self._slack(), float(cost), turns, seconds,
+        )  # fmt: skip
+
+    def _solve_program(self, last_input: Array, weights: Array) -> Status:
         code = program.solve_program(
             self._stages, self._lanes, float(last_input[0]), float(last_input[1]),
             np.ascontiguousarray(weights, dtype=np.float64), self.constants, self._told,
         )  # fmt: skip
-        return STATUS[code], self._inputs()
+        return STATUS[code]
+
+    def _slack(self) -> Array:
+        """Slacks of the solution, (N, 3) in the order of the problem's penalties."""
+        rows = np.array(layout.SLACKS)[list(layout.SLACK_OF)]
+        slack: Array = self._lanes[rows].T.copy()
+        return slack
 
     def _prepare(self, state: Array, plan: Array, reference: Array | None) -> None:
         """Put a first state (6,), a plan (N, 2) and a reference (N + 1, 4) into the stages."""

@@ -3,15 +3,12 @@
 import importlib.metadata
 import json
 import os
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from rich.console import Console
@@ -24,6 +21,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from experiments.interrupts import Interrupts
 from experiments.results import hardware, revision, versions
 from experiments.speed import environments, learning, loops, processes, solvers, tables
 from experiments.speed.figures import picture
@@ -104,32 +102,6 @@ def run_speed(
         write_atomically(folder / "speed.png", drawn)
     tables.show(result, console)
     return result, bool(result["complete"])
-
-
-class Interrupts:
-    """Ctrl-C, remembered: where it comes during a solve, CasADi takes it for a failed solve."""
-
-    def __init__(self) -> None:
-        self._came = False
-        self._before: Any = None
-
-    def __enter__(self) -> "Interrupts":
-        if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGINT, self._remember)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
-
-    def _remember(self, _number: int, _frame: FrameType | None) -> None:
-        self._came = True
-        raise KeyboardInterrupt
-
-    def check(self) -> None:
-        """Raise KeyboardInterrupt if it has come."""
-        if self._came:
-            raise KeyboardInterrupt
 
 
 def _measure(name: str, result: dict[str, Any], effort: Effort, tick: Tick) -> None:

@@ -1,0 +1,161 @@
+"""LPV-MPC with A and B frozen along the last plan: a demonstration, not a controller to use.
+
+The quasi-LPV form x' = A(x, u) x + B(u) u equals the vehicle's field exactly, so one may be tempted
+to freeze its matrices along the last plan and to solve one quadratic program a period. That drops
+the derivatives of A and B, and one of them is what steers: A as printed in kumar2025lpv has no
+column of psi in the rows of X and Y. The program then believes that turning does not move the car
+sideways. Writing sin(psi_ref + e) by sinc(e) e, with e the deviation from the plan's direction of
+travel, puts such a column into the very same field, and the program steers.
+"""
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from agents.base import DrivingTask
+from agents.nmpc.agent import SolvedNmpc
+from agents.nmpc.linearisation import Linearisation
+from agents.nmpc.problem import NmpcProblem, Solution, Status
+from agents.nmpc.rti_solver import RtiSolver
+from agents.weights import TrackingWeights, WeightSchedule
+from lpv_track_env.bicycle import PSI, VX, VY, X, Y
+from lpv_track_env.lpv import matrices
+from lpv_track_env.task import choose
+from lpv_track_env.vehicle import VehicleParameters
+
+Array = NDArray[np.float64]
+
+FORMS = ("literal", "sinc")
+
+
+class FrozenLpvSolver:
+    """One quadratic program a period, its model A(x, u) x + B(u) u frozen along a plan.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    form
+        "literal": the matrices as printed. "sinc": the same field with a column of psi.
+
+    The frozen system is discretised exactly (zero-order hold by a matrix exponential).
+
+    Raises
+    ------
+    ValueError
+        For an unknown form.
+    """
+
+    def __init__(self, problem: NmpcProblem, *, form: str = "literal") -> None:
+        self.problem, self.form = problem, choose("form", form, FORMS)
+        self._rti = RtiSolver(problem)
+
+    def solve(
+        self,
+        state: Array,
+        last_input: Array,
+        reference: Array,
+        weights: Array,
+        warm: Array | None = None,
+    ) -> tuple[Solution, Array | None]:
+        """Solve as `RtiSolver.solve` does, with the frozen model."""
+        began = time.perf_counter()
+        if not np.isfinite(np.concatenate([state, last_input, reference.ravel(), weights])).all():
+            return Solution(Status.NAN, None, None, None, np.nan, 0, 0.0), None
+        low, high = self.problem.input_bounds
+        last = np.clip(last_input, low, high)
+        plan = np.tile(last, (self.problem.horizon, 1))
+        if warm is not None:
+            plan[:-1], plan[-1] = warm[1:], warm[-1]
+        model = self.freeze(state, plan, reference[:, 1])
+        solution = self._rti.solve_model(model, last, reference, weights, plan)
+        return solution._replace(seconds=time.perf_counter() - began), solution.inputs
+
+    def freeze(self, state: Array, inputs: Array, heading: Array) -> Linearisation:
+        """Model frozen along the roll-out of `inputs` (N, 2) from `state` (6,), in discrete time.
+
+        `heading` (N + 1,) rad is the reference's. The model's own states follow it, not the field.
+        """
+        along = self._rti.linearise(state, inputs).states
+        n = len(inputs)
+        a_all, b_all = np.tile(np.eye(6), (n, 1, 1)), np.zeros((n, 6, 2))
+        states = np.zeros((n + 1, 6))
+        rate, rate_x, rate_u = np.zeros(n), np.zeros((n, 6)), np.ones((n, 2))
+        states[0] = state
+        for i in range(n):
+            a, b, constant = self._continuous(along[i], inputs[i], heading[i])
+            a_all[i], b_all[i], offset = _held(a, b, constant, self.problem.period)
+            states[i + 1] = a_all[i] @ states[i] + b_all[i] @ inputs[i] + offset
+            rate[i] = a[VX] @ states[i] + b[VX] @ inputs[i]
+            rate_x[i], rate_u[i] = a[VX], b[VX]
+        return Linearisation(states, a_all, b_all, rate, rate_x, rate_u)
+
+    def _continuous(self, x: Array, u: Array, heading: float) -> tuple[Array, Array, Array]:
+        """A (6, 6), B (6, 2) and what is left over (6,), whose sum A x + B u + c is the field."""
+        a, b = matrices(x, u, self.problem.vehicle)
+        constant = np.zeros(6)
+        if self.form == "sinc":
+            e = x[PSI] - heading
+            sinc = float(np.sinc(e / np.pi))
+            c, s = np.cos(heading), np.sin(heading)
+            a[X, VX] = a[Y, VY] = c * np.cos(e)
+            a[Y, VX] = s * np.cos(e)
+            a[X, VY] = -a[Y, VX]
+            a[X, PSI] = -(s * x[VX] + c * x[VY]) * sinc
+            a[Y, PSI] = (c * x[VX] - s * x[VY]) * sinc
+            constant[X], constant[Y] = -a[X, PSI] * heading, -a[Y, PSI] * heading
+        return a, b, constant
+
+
+def _held(a: Array, b: Array, constant: Array, period: float) -> tuple[Array, Array, Array]:
+    """Discrete-time A, B and constant of x' = A x + B u + c with u held for a period, s."""
+    block = np.zeros((9, 9))
+    block[:6, :6], block[:6, 6:8], block[:6, 8] = a, b, constant
+    held: Array = expm(block * period)
+    return held[:6, :6], held[:6, 6:8], held[:6, 8]
+
+
+class FrozenLpvMpc(SolvedNmpc):
+    """LPV-MPC with frozen matrices, to show what that leaves out. Use `lpv-nmpc` to drive.
+
+    Parameters
+    ----------
+    task
+        What is driven.
+    form
+        "literal" or "sinc", see `FrozenLpvSolver`.
+    horizon, weights, selection, model, linear_penalty, quadratic_penalty, max_failures
+        See `RtiNmpc`.
+
+    Raises
+    ------
+    ValueError
+        If a setting is out of range, or the form unknown.
+    """
+
+    def __init__(
+        self,
+        task: DrivingTask,
+        *,
+        form: str = "literal",
+        horizon: int | None = None,
+        weights: TrackingWeights | WeightSchedule | None = None,
+        selection: str = "band",
+        model: VehicleParameters | None = None,
+        linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),
+        quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0),
+        max_failures: int = 10,
+    ) -> None:
+        super().__init__(
+            task,
+            horizon=horizon,
+            weights=weights,
+            selection=selection,
+            model=model,
+            linear_penalty=linear_penalty,
+            quadratic_penalty=quadratic_penalty,
+            max_failures=max_failures,
+        )
+        self.solver = FrozenLpvSolver(self.problem, form=form)
