@@ -67,7 +67,10 @@ NEAR = 1e-4
 HELD = 1e-9
 """Largest gap of a constraint that binds."""
 SLIGHT = 1e-9
-STIFFNESS = 1e7
+"""Multiplier below zero at which a constraint is freed."""
+STIFFNESS = 1e6
+"""Of the augmented Lagrangian. Stiffer, rounding in the recursion drowns small multipliers and the
+guesses go round in circles; softer, it takes more turns to hold what binds."""
 
 
 @compiled_internal
@@ -188,9 +191,9 @@ def hold(lanes: Array, constants: Array) -> None:
 
 
 @compiled_internal
-def revise(lanes: Array, constants: Array) -> tuple[bool, Float]:
-    """Mend the guess after a step; whether it changed, and by how much what binds is missed."""
-    changed, off = False, 0.0
+def revise(lanes: Array, constants: Array) -> tuple[int, Float]:
+    """Mend the guess after a step; in how many places, and by how much what binds is missed."""
+    changed, off = 0, 0.0
     for k in range(PAIRS):
         if is_slack(k):
             continue
@@ -200,18 +203,22 @@ def revise(lanes: Array, constants: Array) -> tuple[bool, Float]:
             gap, was = gaps[i], mode[i]
             if was == FREE:
                 if gap < -HELD:
-                    mode[i], lam[i], changed = BINDING, 0.0, True
+                    mode[i], lam[i] = BINDING, 0.0
+                    changed += 1
             elif was == BINDING:
                 force = lam[i] - STIFFNESS * gap
                 if force < -SLIGHT:
-                    mode[i], lam[i], changed = FREE, 0.0, True
+                    mode[i], lam[i] = FREE, 0.0
+                    changed += 1
                 elif force > linear:
-                    mode[i], changed = BROKEN_SOFT, True
+                    mode[i] = BROKEN_SOFT
+                    changed += 1
                 else:
                     lam[i] = force
                     off = max(off, abs(gap))
             elif gap > HELD:
-                mode[i], lam[i], changed = BINDING, linear, True
+                mode[i], lam[i] = BINDING, linear
+                changed += 1
     return changed, off
 
 

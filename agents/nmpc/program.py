@@ -71,9 +71,11 @@ GUESSING, PREDICTING, CORRECTING = 0, 1, 2
 """Phases: guesses, then predictor and corrector in turns."""
 MAX_GUESSES, MAX_CROSSINGS = 6, 4
 """Turns of guesses, at first and from what the interior-point method has found."""
+HOPEFUL = 8
+"""Places in which a guess may be mended; in more than that, only while they get fewer."""
 MAX_ITERATIONS = 40
 CROSSING, NEXT_CROSSING = 1e-6, 1e-3
-"""Mean product t lam at which that is tried."""
+"""Mean product t lam at which guesses are tried again, and its factor for each further time."""
 CAUTION, LEAST_CAUTION = 0.995, 0.9999
 """Share of the way to the nearest bound, at first and near the solution."""
 ACCEPTABLE = 1e-6
@@ -144,7 +146,7 @@ def solve_program(
     guess(lanes)
     mu, worst, share, tolerance = START_BARRIER, 0.0, 1.0, constants[TOLERANCE]
     phase, tries, most, iterations = GUESSING, 0, MAX_GUESSES, 0
-    code, changed, inside, crossing = UNDECIDED, True, False, CROSSING
+    code, changed, before, inside, crossing = UNDECIDED, 1, 0, False, CROSSING
     # All methods take turns through one loop: each part is called from one place only, which
     # halves the time that compiling takes.
     while True:
@@ -161,7 +163,7 @@ def solve_program(
                     break
                 weigh(lanes, constants)
             press(lanes, constants, share)
-        if phase == PREDICTING or (phase == GUESSING and changed):
+        if phase == PREDICTING or (phase == GUESSING and changed > 0):
             riccati.factor(stages, lanes, weights, constants)
         riccati.solve(stages, lanes, weights, constants)
         length = 1.0
@@ -194,18 +196,19 @@ def solve_program(
                 # From inside to the edge: which bind can be told by now.
                 take(stages, KEPT, NOW_A)
                 identify(lanes)
-                phase, tries, most, changed = GUESSING, 0, MAX_CROSSINGS, True
+                phase, tries, most, changed = GUESSING, 0, MAX_CROSSINGS, 1
                 crossing *= NEXT_CROSSING
             continue
         tries += 1
         off = math.inf
         if finite:
+            before = changed
             changed, off = revise(lanes, constants)
-        if not changed and off <= HELD:
+        if changed == 0 and off <= HELD:
             take_slacks(lanes)
             code = SUCCESS
             break
-        if tries < most and finite:
+        if tries < most and finite and (tries < 2 or changed <= max(before, HOPEFUL)):
             continue
         phase = PREDICTING
         if inside:
