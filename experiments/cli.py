@@ -38,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
         "lpv-track benchmark --agents stanley lqr --trajectories T1 T2 --out results/mine",
     )
     benchmark.add_argument(
-        "--suite", default="paper", help="paper (default), quick, converged or sideslip"
+        "--suite", default="paper", help="paper (default), quick, converged, sideslip or frozen"
     )
     benchmark.add_argument(
         "--agents", nargs="+", metavar="NAME", help="default: all; your own: file.py:Class"

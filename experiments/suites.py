@@ -11,6 +11,8 @@ Spec = dict[str, Any]
 SIX = tuple(PUBLISHED)
 RAW = tuple(f"{name}-raw" for name in SIX)
 RAW_PREVIEW = {"preview_steps": 30, "preview_period": 0.1}
+DEMONSTRATION = "lpv-mpc-frozen"
+"""An agent that shows why not to drive so."""
 
 
 def grid(
@@ -86,15 +88,30 @@ def sideslip(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
     ]
 
 
+def frozen(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:  # noqa: ARG001
+    """Both forms of the LPV-MPC with frozen matrices beside the NMPC, whatever agents are named."""
+    return [
+        *grid(("lpv-nmpc",), SIX, seeds=seeds),
+        *grid((DEMONSTRATION,), SIX, seeds=seeds, agent_settings={"form": "literal"}),
+        *grid((DEMONSTRATION,), SIX, seeds=seeds, agent_settings={"form": "sinc"}),
+    ]
+
+
 def _by_speed(agent_names: Sequence[str]) -> tuple[list[str], list[str]]:
     """Agents that solve to convergence at every step, and all others."""
     solved = [name for name in agent_names if name == "lpv-nmpc-ipopt"]
     return solved, [name for name in agent_names if name not in solved]
 
 
-SUITES = {"paper": paper, "quick": quick, "sideslip": sideslip, "converged": converged}
+SUITES = {
+    "paper": paper,
+    "quick": quick,
+    "sideslip": sideslip,
+    "converged": converged,
+    "frozen": frozen,
+}
 
 
 def default_agents() -> list[str]:
-    """Every agent that needs no more than this project's own packages."""
-    return agents.names()
+    """Every agent to drive with that needs no more than this project's own packages."""
+    return [name for name in agents.names() if name != DEMONSTRATION]

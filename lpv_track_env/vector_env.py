@@ -318,11 +318,14 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         # A copy: a reset of some environments hands out the others' observations again.
         return self._observations.copy(), rewards, ended & ~truncated, truncated
 
-    def _check_order(self) -> None:
+    def _check_begun(self) -> None:
         if not self._begun:
             if self._episodes.min() < 0:
                 raise gymnasium.error.ResetNeeded("the episodes have not begun: call reset() first")
             self._begun = True
+
+    def _check_order(self) -> None:
+        self._check_begun()
         if self.autoreset_mode is AutoresetMode.DISABLED and self._ends.any():
             raise gymnasium.error.ResetNeeded(
                 f"the episode of environment {int(np.argmax(self._ends != 0))} has ended: call "
@@ -374,10 +377,17 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         return list(seed)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Draw every environment: n frames (600, 900, 3) uint8, without trails."""
+        """Draw every environment: n frames (600, 900, 3) uint8, without trails.
+
+        Raises
+        ------
+        ResetNeeded
+            Before the first reset.
+        """
         if self.render_mode is None:
             gymnasium.logger.warn("render() needs render_mode='rgb_array'")
             return None
+        self._check_begun()
         return tuple(
             self._single.draw(self.task_of(i), self._memories[i]) for i in range(self.num_envs)
         )

@@ -449,6 +449,8 @@ def test_bad_argument_is_named(settings: dict[str, Any], message: str) -> None:
 def test_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "offscreen")
     env = make(2, trajectory="u-turn", render_mode="rgb_array", random_start=True)
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"call reset\(\) first"):
+        env.render()
     env.reset(seed=0)
     frames = env.render()
     assert frames is not None

@@ -1,0 +1,50 @@
+"""Suites: what they drive, and that all of it can be driven."""
+
+from collections import Counter
+
+import pytest
+
+import agents
+from experiments.cases import Case
+from experiments.suites import DEMONSTRATION, RAW, SIX, SUITES, default_agents
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_cases_of_a_suite_are_valid_and_distinct(suite: str) -> None:
+    specs = SUITES[suite](default_agents(), [0, 1])
+    cases = [Case(**spec) for spec in specs]
+    assert len({case.id for case in cases}) == len(cases) > 0
+    assert {case.seed for case in cases} == {0, 1}
+
+
+def test_default_agents_are_those_to_drive_with() -> None:
+    assert set(agents.names()) - set(default_agents()) == {DEMONSTRATION}
+    drive = [Case(**spec) for suite in ("paper", "quick") for spec in
+             SUITES[suite](default_agents(), [0])]  # fmt: skip
+    assert {case.agent for case in drive} == set(default_agents())
+
+
+def test_what_ipopt_does_not_drive_in_one_suite_it_drives_in_another() -> None:
+    names, solved = default_agents(), "lpv-nmpc-ipopt"
+    counts = {
+        suite: Counter(
+            (spec["agent"], spec["trajectory"], spec["vehicle"], spec["speed_mode"])
+            for spec in SUITES[suite](names, [0])
+        )
+        for suite in ("paper", "converged")
+    }
+    both = counts["paper"] + counts["converged"]
+    fast = {key[1:] for key in counts["paper"] if key[0] == "lpv-nmpc"}
+    assert {key[1:] for key in both if key[0] == solved} == fast
+    assert {key[1] for key in counts["paper"] if key[0] == solved} == set(SIX)
+    assert {key[1] for key in both} == {*SIX, *RAW}
+
+
+def test_frozen_compares_both_forms_with_the_nmpc() -> None:
+    specs = SUITES["frozen"](["stanley"], [0])
+    forms = Counter((spec["agent"], str(spec.get("agent_settings", {}))) for spec in specs)
+    assert forms == {
+        ("lpv-nmpc", "{}"): 6,
+        (DEMONSTRATION, "{'form': 'literal'}"): 6,
+        (DEMONSTRATION, "{'form': 'sinc'}"): 6,
+    }
