@@ -130,29 +130,26 @@ def identify(lanes: Array) -> None:
     """
     for k in range(PAIRS):
         # Hard ones have no slack; each soft constraint's is the third of its pairs.
-        own = k + (2 - (k - 8) % 3) if k >= 8 else k
-        t, lam, mode, kept = lanes[T + k], lanes[LAM + k], lanes[MODE + k], lanes[DLAM + k]
-        slack, force = lanes[T + own], lanes[LAM + own]
+        own = k + 2 - (k - 8) % 3 if k >= 8 else k
         for i in range(lanes.shape[1]):
-            kept[i] = lam[i]
-            found = FREE
-            if lam[i] > t[i]:
-                found = BROKEN_SOFT if k >= 8 and slack[i] > force[i] else BINDING
-            mode[i] = found if not is_slack(k) else FREE
+            lam, found = lanes[LAM + k, i], FREE
+            if lam > lanes[T + k, i] and not is_slack(k):
+                found = BINDING
+                if own > k and lanes[T + own, i] > lanes[LAM + own, i]:
+                    found = BROKEN_SOFT
+            lanes[DLAM + k, i], lanes[MODE + k, i] = lam, found
     for k in range(PAIRS):
-        mode, lam = lanes[MODE + k], lanes[LAM + k]
         for i in range(lanes.shape[1]):
-            if mode[i] != BINDING:
-                lam[i] = 0.0
+            if lanes[MODE + k, i] != BINDING:
+                lanes[LAM + k, i] = 0.0
 
 
 @compiled_internal
 def recall(lanes: Array) -> None:
     """Give the interior-point method its multipliers back."""
     for k in range(PAIRS):
-        lam, kept = lanes[LAM + k], lanes[DLAM + k]
         for i in range(lanes.shape[1]):
-            lam[i] = kept[i]
+            lanes[LAM + k, i] = lanes[DLAM + k, i]
 
 
 @compiled_internal
