@@ -1,43 +1,19 @@
 """The real-time NMPC on observations of every kind: a status for each, and an action to drive."""
 
 from collections import Counter
-from typing import Any
 
 import numpy as np
 import pytest
 from driven_vehicles import drives, environment, made
 from nmpc_situations import WEIGHTS
-from numpy.typing import NDArray
 
 from agents.nmpc.problem import Status
 from agents.weights import TrackingWeights
+from experiments.speed.wild import wild_observations
 from lpv_track_env.vehicle import VEHICLES
 
-Array = NDArray[Any]
 MAX_ITERATIONS = 44
 """Turns of both methods, with a last try to end in a guess."""
-
-
-def wild_observations(rng: np.random.Generator, count: int, steps: int) -> Array:
-    """Speeds to 30 m/s, errors to 5 m and 1 rad, actuators and curvature beyond all bounds."""
-    rows = np.empty((count, 8 + 2 * steps))
-    scalars = [(0.0, 30.0), (-3.0, 3.0), (-1.5, 1.5), (-9.0, 6.0), (-0.8, 0.8), (-5.0, 5.0),
-               (-1.0, 1.0), (0.0, 30.0)]  # fmt: skip
-    for k, bounds in enumerate(scalars):
-        rows[:, k] = rng.uniform(*bounds, count)
-    # Half of the paths bend steadily, half jump about; a tenth are beyond any path.
-    curvature = rng.uniform(-0.5, 0.5, (count, 1)) * np.ones(steps)
-    jumping = rng.random(count) < 0.5
-    curvature[jumping] = rng.uniform(-0.5, 0.5, (int(jumping.sum()), steps))
-    curvature[rng.random(count) < 0.1] *= 10.0
-    rows[:, 8 : 8 + steps] = curvature
-    ramp = rng.uniform(-3.0, 3.0, (count, 1)) * 0.05 * np.arange(1, steps + 1)
-    rows[:, 8 + steps :] = np.clip(rows[:, 7:8] + ramp, 0.0, 30.0)
-    broken = np.flatnonzero(rng.random(count) < 0.05)
-    rows[broken, rng.integers(0, rows.shape[1], len(broken))] = rng.choice(
-        [np.nan, np.inf, -np.inf], len(broken)
-    )
-    return rows.astype(np.float32)
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)

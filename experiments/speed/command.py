@@ -23,7 +23,7 @@ from rich.progress import (
 
 from experiments.interrupts import Interrupts
 from experiments.results import hardware, revision, versions
-from experiments.speed import environments, learning, loops, processes, solvers, tables
+from experiments.speed import environments, learning, loops, processes, solvers, tables, wild
 from experiments.speed.figures import picture
 from experiments.speed.measure import FULL, QUICK, Effort, Section, Tick
 from lpv_track_env.task import choose
@@ -39,6 +39,7 @@ SECTIONS: dict[str, tuple[str, Measure]] = {
     "solvers": ("NMPC solvers on the same observations", solvers.solvers),
     "horizons": ("NMPC solvers over the horizon", solvers.horizons),
     "batches": ("NMPC on batches of observations", solvers.batches),
+    "wild": ("The real-time NMPC on wild observations", wild.wild),
     "loops": ("Closed loops in compiled code", loops.loops),
     "memory": ("Memory of fresh processes", processes.memory),
     "startup": ("Start-up of fresh processes", processes.startup),
