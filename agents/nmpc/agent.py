@@ -174,7 +174,6 @@ class IpoptNmpc(SolvedNmpc):
             quadratic_penalty=quadratic_penalty,
             max_failures=max_failures,
         )
-        self.solver: Solver
         if choose("solver", solver, SOLVERS) == "fatrop":
             self.solver = FatropSolver(self.problem, tolerance=tolerance)
         else:

@@ -60,8 +60,8 @@ from trajectories.compilation import compiled_in_place, compiled_internal
 Array = NDArray[Any]
 Float = Any
 
-UNDECIDED, SUCCESS, MAXITER, NOT_FINITE, QP_FAILURE = range(-1, 4)
-"""Codes of a solve, but for the first by `problem.Status`: SUCCESS, MAXITER, NAN, QP_FAILURE."""
+SUCCESS, MAXITER, NOT_FINITE, QP_FAILURE = range(4)
+"""Codes of a solve, by `problem.Status`: SUCCESS, MAXITER, NAN, QP_FAILURE."""
 
 # What is told of a solve, (TOLD,): code, iterations in programs, programs, cost, largest slacks.
 CODE, INNER, OUTER, COST, SLACK = 0, 1, 2, 3, 4
@@ -115,7 +115,7 @@ def follow(stages: Array) -> None:
 
 
 @compiled_internal
-def take(stages: Array, to: int, at: int) -> None:
+def copy_point(stages: Array, to: int, at: int) -> None:
     """Copy a point of all stages, from column `at` on."""
     for i in range(stages.shape[0]):
         for k in range(POINT):
@@ -123,7 +123,7 @@ def take(stages: Array, to: int, at: int) -> None:
 
 
 @compiled_internal
-def advance(stages: Array, length: Float) -> None:
+def move_by_step(stages: Array, length: Float) -> None:
     """Move the solution so far by `length` times the step."""
     for i in range(stages.shape[0]):
         for k in range(POINT):
@@ -141,12 +141,12 @@ def solve_program(
     stages' NOW and, in the lanes, the slacks. Returns a code; adds to `told` (TOLD,).
     """
     n = lanes.shape[1]
-    take(stages, NOW_A, PLAN_A)
+    copy_point(stages, NOW_A, PLAN_A)
     measure_gaps(stages, lanes, last_a, last_delta, constants)
     guess(lanes)
     mu, worst, share, tolerance = START_BARRIER, 0.0, 1.0, constants[TOLERANCE]
     phase, tries, most, iterations = GUESSING, 0, MAX_GUESSES, 0
-    code, changed, before, inside, crossing = UNDECIDED, 1, 0, False, CROSSING
+    code, changed, before, inside, crossing = QP_FAILURE, 1, 0, False, CROSSING
     # All methods take turns through one loop: each part is called from one place only, which
     # halves the time that compiling takes.
     while True:
@@ -185,7 +185,7 @@ def solve_program(
             mu = update(lanes, length)
             share *= 1.0 - length
         if finite:
-            advance(stages, length)
+            move_by_step(stages, length)
         iterations += 1
         near = max(mu, share * worst) <= crossing or iterations >= MAX_ITERATIONS
         if phase == GUESSING or near:
@@ -194,7 +194,7 @@ def solve_program(
             phase = PREDICTING
             if near:
                 # From inside to the edge: which bind can be told by now.
-                take(stages, KEPT, NOW_A)
+                copy_point(stages, KEPT, NOW_A)
                 identify(lanes)
                 phase, tries, most, changed = GUESSING, 0, MAX_CROSSINGS, 1
                 crossing *= NEXT_CROSSING
@@ -212,7 +212,7 @@ def solve_program(
             continue
         phase = PREDICTING
         if inside:
-            take(stages, NOW_A, KEPT)
+            copy_point(stages, NOW_A, KEPT)
             recall(lanes)
         else:
             # Start the interior-point method where all inputs keep their limits.

@@ -9,8 +9,7 @@ One step minimises, over dx_0 = 0, dx_{i+1} = A_i dx_i + B_i du_i and du_{-1} = 
 with n_i the gradient of vx', Hu and W diagonal, and Hx diagonal but for (vx, vy). Hessians and
 gradients are the cost's own, which is taken at the solution so far, plus what the inequalities add
 (barrier and slope in the lanes of `layout`; those by vx and vy are at a period's end). The value
-function of stage i has as its
-arguments dx_i and p = du_{i-1}:
+function of stage i has as its arguments dx_i and p = du_{i-1}:
 
     1/2 x' P x + x' T p + 1/2 p' U p + s' x + t' p
 
