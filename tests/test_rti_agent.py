@@ -1,5 +1,8 @@
 """The real-time NMPC as an agent of batches: memories, weights, and observations of every kind."""
 
+import subprocess
+import sys
+
 import numba
 import numpy as np
 import pytest
@@ -109,6 +112,22 @@ def test_control_of_one_row_of_a_batch_is_predict_of_that_row() -> None:
 def test_impossible_threads_are_refused(threads: int) -> None:
     with pytest.raises(ValueError, match=rf"threads must be from 1 to \d+ .*, not {threads}"):
         made(threads=threads)
+
+
+def test_nothing_is_compiled_within_a_control_period() -> None:
+    """In a fresh process: making the agent compiles, or loads, all that its first call needs."""
+    code = (
+        "import gymnasium, lpv_track_env, agents\n"
+        "from agents.nmpc import rti\n"
+        "env = gymnasium.make('lpv_track_env/PathTracking-v0', trajectory='u-turn')\n"
+        "observation, _ = env.reset(seed=0)\n"
+        "agent = agents.make('lpv-nmpc', env)\n"
+        "made = len(rti.control.signatures)\n"
+        "agent.predict(observation)\n"
+        "print(made, len(rti.control.signatures))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1", "1"]
 
 
 def test_memories_are_handed_in_and_out() -> None:

@@ -147,6 +147,8 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         self._work = layout.working_space(self.problem.horizon, shares(self._threads))
         self._memory: RtiMemory | None = None
         self._size = task.layout.size
+        # Of no rows: so it compiles here, if need be, and not within the first control period.
+        self._control(np.zeros((0, self._size)), self._rows, self._new(0))
 
     @property
     def _rows(self) -> Array:
@@ -222,7 +224,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             memory.states, memory.actions,
         )  # fmt: skip
         chunks = min(len(stages), len(rows))
-        if chunks == 1:
+        if chunks <= 1:
             return rti.control(0, *arguments, stages[0], lanes[0])
         failed = np.zeros(chunks, dtype=np.int64)
         with using_threads(self._threads):
