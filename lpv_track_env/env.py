@@ -12,7 +12,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from lpv_track_env import episodes, kernels, vehicle
-from lpv_track_env.episodes import given_start, random_key
+from lpv_track_env.draws import random_key
+from lpv_track_env.episodes import given_start
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.task import CONDITIONS, Task, action_space, checked_period, choose, reference

@@ -1,8 +1,7 @@
-"""How episodes begin: counter-based random draws and the memory they lead to.
+"""How episodes begin: what is drawn for them (`draws`) and the memory it leads to.
 
-An environment holds one random 64-bit key. Every draw is a hash of (key, episode number, what is
-drawn), by the mixing function of splitmix64 (Steele, Lea, Flood 2014), so an episode does not
-depend on how many environments there are, on which of them reset before, or on what else was drawn.
+An environment holds one random 64-bit key and counts its episodes. An episode does not depend on
+how many environments there are, on which of them reset before, or on what else was drawn.
 """
 
 import math
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from lpv_track_env import kernels
 from lpv_track_env.bicycle import PSI, VX, X, Y
+from lpv_track_env.draws import uniform
 from trajectories.compilation import compiled, compiled_internal
 from trajectories.interpolation import heading_at, position_at, speed_at
 
@@ -25,16 +25,8 @@ TRAJECTORY_DRAW, VEHICLE_DRAW, START_DRAW, LATERAL_DRAW, HEADING_DRAW, SPEED_DRA
 GIVEN = ("arc_length", "lateral_error", "heading_error", "speed_error")
 """What `begin` takes instead of drawing it, in this order; NaN is drawn."""
 
-GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-FIRST_FACTOR, SECOND_FACTOR = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-SHIFTS = (np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11))
 ROLLING_DECELERATION = 6
 """Index of mu g in the constants."""
-
-
-def random_key(generator: np.random.Generator) -> np.uint64:
-    """Key of the episodes that follow a seed, uint64."""
-    return generator.integers(0, 2**64, dtype=np.uint64)
 
 
 def given_start(options: Mapping[str, Any], length: float) -> NDArray[np.float64]:
@@ -59,28 +51,6 @@ def given_start(options: Mapping[str, Any], length: float) -> NDArray[np.float64
             raise ValueError(f"option arc_length must be in [0, {length:.2f}] m, not {value}")
         start[k] = value
     return start
-
-
-@compiled_internal
-def mix(z: Any) -> Any:
-    """Finaliser of splitmix64: a bijection of 64-bit numbers that scatters them."""
-    z = (z ^ (z >> SHIFTS[0])) * FIRST_FACTOR
-    z = (z ^ (z >> SHIFTS[1])) * SECOND_FACTOR
-    return z ^ (z >> SHIFTS[2])
-
-
-@compiled_internal
-def uniform(key: Any, episode: Any, draw: int) -> Any:
-    """Number in [0, 1) for a key (uint64), an episode (from 0) and a draw."""
-    z = mix(key + GOLDEN * (np.uint64(episode) + np.uint64(1)))
-    z = mix(z + GOLDEN * (np.uint64(draw) + np.uint64(1)))
-    return np.float64(z >> SHIFTS[3]) * 2.0**-53
-
-
-@compiled_internal
-def choice(key: Any, episode: Any, draw: int, count: int) -> int:
-    """One of `count` indices."""
-    return min(int(uniform(key, episode, draw) * count), count - 1)
 
 
 @compiled_internal

@@ -145,6 +145,15 @@ def locate(
     return index, u
 
 
+@compiled
+def look(
+    memory: Array, constants: Array, table: Array, observation: Array, ahead: Any, window: Any
+) -> None:
+    """Find the memory's state on the path, about `ahead` m from its arc length, and observe it."""
+    index, u = locate(memory, constants, table, memory[ARC_LENGTH], ahead, window)
+    observe(memory, constants, table, observation, index, u)
+
+
 @compiled_inline
 def judge(memory: Array, constants: Array, finite: bool) -> int:
     """How the episode stands: RUNNING or the code of its end."""

@@ -46,6 +46,11 @@ def checked_period(value: float) -> float:
     return period
 
 
+def longest_substep(vehicle: VehicleParameters) -> float:
+    """Longest step of the integration that resolves a vehicle's dynamics at any speed, s."""
+    return min(LONGEST_SUBSTEP, POLE_STEP / fastest_pole(0.0, vehicle))
+
+
 def reference(
     trajectory: str | Path | ReferencePath,
     parameters: VehicleParameters,
@@ -111,8 +116,7 @@ class Task:
     @property
     def substeps(self) -> int:
         """Integration steps in a control period."""
-        longest = min(LONGEST_SUBSTEP, POLE_STEP / fastest_pole(0.0, self.vehicle))
-        return math.ceil(self.control_period / longest - 1e-9)
+        return math.ceil(self.control_period / longest_substep(self.vehicle) - 1e-9)
 
     @property
     def max_steps(self) -> int:

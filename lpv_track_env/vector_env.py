@@ -13,8 +13,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels, vector_kernels
+from lpv_track_env.draws import random_key
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
-from lpv_track_env.episodes import GIVEN, given_start, random_key
+from lpv_track_env.episodes import GIVEN, given_start
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task, action_space, choose
 from lpv_track_env.threads import checked_threads, shares, using_threads

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
-from lpv_track_env.episodes import TRAJECTORY_DRAW, VEHICLE_DRAW, begin, choice
+from lpv_track_env.draws import choice
+from lpv_track_env.episodes import TRAJECTORY_DRAW, VEHICLE_DRAW, begin
 from lpv_track_env.integration import in_half_steps, integrate, rotate, runge_kutta
 from trajectories.compilation import compiled, compiled_inline, compiled_internal, compiled_parallel
 

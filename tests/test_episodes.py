@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from lpv_track_env import episodes, kernels
+from lpv_track_env import draws, episodes, kernels
 from lpv_track_env.env import PathTrackingEnv
 
 GOLDEN = 0x9E3779B97F4A7C15
@@ -19,13 +19,13 @@ PUBLISHED = (
 def test_mixing_function_is_that_of_splitmix64() -> None:
     for k, wanted in enumerate(PUBLISHED):
         state = (1234567 + (k + 1) * GOLDEN) % 2**64
-        assert int(episodes.mix(np.uint64(state))) == wanted
+        assert int(draws.mix(np.uint64(state))) == wanted
 
 
 def draws(key: int, count: int, draws_each: int = 6) -> np.ndarray:
     return np.array(
         [
-            [episodes.uniform(np.uint64(key), episode, draw) for draw in range(draws_each)]
+            [draws.uniform(np.uint64(key), episode, draw) for draw in range(draws_each)]
             for episode in range(count)
         ]
     )
@@ -49,7 +49,7 @@ def test_draws_are_uniform_and_independent() -> None:
 
 
 def test_choices_are_uniform() -> None:
-    picks = [episodes.choice(np.uint64(9), k, 0, 7) for k in range(7000)]
+    picks = [draws.choice(np.uint64(9), k, 0, 7) for k in range(7000)]
     counts = np.bincount(picks, minlength=7)
     assert counts.shape == (7,)
     assert np.abs(counts - 1000).max() < 5.0 * math.sqrt(7000 / 7 * 6 / 7)

@@ -1,0 +1,73 @@
+"""Observations of a path from estimated states: for a vehicle's own computer, and for logs."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lpv_track_env import kernels
+from lpv_track_env.observation import ObservationLayout
+from trajectories import ReferencePath
+from trajectories.projection import SEARCH_WINDOW, tightest_turn
+
+
+class PathObserver:
+    """Makes of estimated states the observations that the environments would give of them.
+
+    Parameters
+    ----------
+    path
+        The reference; its speed is what the preview shows.
+    layout
+        The observation's layout: that of the agent it is for.
+
+    Examples
+    --------
+    >>> observer = PathObserver(trajectories.load("T2"), ObservationLayout())
+    >>> observer.begin(state)
+    >>> action, _ = agent.predict(observer.observe(state, acceleration, steering_angle))
+    """
+
+    def __init__(self, path: ReferencePath, layout: ObservationLayout) -> None:
+        self.path, self.layout = path, layout
+        self._memory = np.zeros(kernels.MEMORY_SIZE)
+        self._observation = np.zeros(layout.size, dtype=np.float32)
+        self._constants = np.zeros(kernels.CONSTANTS_SIZE)
+        self._constants[kernels.LENGTH] = path.length
+        self._constants[kernels.CLOSED] = float(path.closed)
+        self._constants[kernels.TIGHTEST] = tightest_turn(path.table, path.closed)
+        self._constants[kernels.PREVIEW_PERIOD] = layout.preview_period
+
+    def begin(self, state: ArrayLike, near: float | None = None) -> None:
+        """Find the place on the path: the foot point nearest to a state (6,), or to `near` (m)."""
+        values = np.asarray(state, dtype=np.float64)
+        x, y = float(values[4]), float(values[5])
+        arc = self.path.project(x, y, near=near).arc_length
+        self._memory[kernels.ARC_LENGTH] = arc
+
+    def observe(
+        self, state: ArrayLike, acceleration: float, steering_angle: float
+    ) -> NDArray[np.float32]:
+        """Observation (size,) of an estimated state [vx, vy, psi, r, X, Y] and the actuators.
+
+        The foot point is searched near the last one, so on the local branch of the path.
+        """
+        self._memory[:6] = state
+        self._memory[kernels.ACCELERATION] = acceleration
+        self._memory[kernels.STEERING] = steering_angle
+        window = min(SEARCH_WINDOW, self.path.length)
+        kernels.look(self._memory, self._constants, self.path.table, self._observation, 0.0, window)
+        return self._observation.copy()
+
+    @property
+    def arc_length(self) -> float:
+        """Of the last foot point, m; on a closed path it runs on over laps."""
+        return float(self._memory[kernels.ARC_LENGTH])
+
+    @property
+    def lateral_error(self) -> float:
+        """Of the last state, m, left positive."""
+        return float(self._memory[kernels.LATERAL_ERROR])
+
+    @property
+    def heading_error(self) -> float:
+        """Of the last state, rad."""
+        return float(self._memory[kernels.HEADING_ERROR])
