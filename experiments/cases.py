@@ -22,7 +22,8 @@ from experiments import metrics
 from experiments.rollout import Rollout, rollout
 from lpv_track_env import vehicle
 from lpv_track_env.env import PathTrackingEnv
-from lpv_track_env.task import SPEED_MODES, choose
+from lpv_track_env.naming import choose
+from lpv_track_env.task import SPEED_MODES
 from trajectories.compilation import source_digest
 
 VEHICLE_FIELDS = tuple(field.name for field in fields(vehicle.VehicleParameters))

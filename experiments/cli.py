@@ -204,7 +204,7 @@ def _benchmark(options: argparse.Namespace, console: object) -> int:
 
     from experiments import suites
     from experiments.benchmark import distinct, finish, parse_settings, run_benchmark
-    from lpv_track_env.task import choose
+    from lpv_track_env.naming import choose
 
     assert isinstance(console, Console)
     if options.seeds < 1:

@@ -38,6 +38,12 @@ LOW_SPEED = 1.0
 """m/s below which 1/|vx| is replaced by a polynomial: the lower end of the paper's speed range."""
 
 
+LONGEST_SUBSTEP = 0.005
+"""s; shortened where the vehicle's fastest pole at standstill asks for it."""
+POLE_STEP = 1.5
+"""Largest product of substep and pole; Runge-Kutta's stability ends at 2.78."""
+
+
 def inverse_speed_polynomial(ratio: Any, bounded_speed: Any) -> Any:
     """Continuation q of 1/|vx|, for any backend; equals 1/|vx| exactly where |vx| >= LOW_SPEED.
 
@@ -257,6 +263,11 @@ def fastest_pole(vx: float, parameters: VehicleParameters) -> float:
         ]
     )
     return float(np.abs(np.linalg.eigvals(block)).max())
+
+
+def longest_substep(parameters: VehicleParameters) -> float:
+    """Longest step of the integration that resolves a vehicle's dynamics at any speed, s."""
+    return min(LONGEST_SUBSTEP, POLE_STEP / fastest_pole(0.0, parameters))
 
 
 compiled_field = compiled_internal(field)

@@ -11,12 +11,16 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lpv_track_env import episodes, kernels, vehicle
+from lpv_track_env import episodes, kernels, real, real_env, vehicle
+from lpv_track_env.conditions import LONGEST_DELAY, Actuation, Conditions
+from lpv_track_env.conditions import load as load_conditions
 from lpv_track_env.draws import random_key
 from lpv_track_env.episodes import given_start
+from lpv_track_env.naming import choose
 from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.real import RealArrays
 from lpv_track_env.reward import TERMS, RewardWeights
-from lpv_track_env.task import CONDITIONS, Task, action_space, checked_period, choose, reference
+from lpv_track_env.task import Task, action_space, checked_period, reference
 from lpv_track_env.vector_infos import single_info
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
@@ -94,6 +98,11 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     `lateral_error, heading_error, speed_error, arc_length, state` (truth, (6,): vx, vy, psi, r, X,
     Y), `reward_terms, clipped`, and at the end `end`.
 
+    Under other conditions than "simulation" the observation is made of an estimate, with everything
+    else of the truth as ever, and there are also `estimate` (6,), `position_deviation` (m, of the
+    filter, in the worst direction; NaN without one), `stopping` (the vehicle brakes by itself:
+    no fixes or no commands for too long) and `deadline_misses` (so far in the episode).
+
     ## Arguments
 
     trajectory
@@ -104,7 +113,10 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         "variable": the path's own speed profile. "fixed": one constant speed in m/s, by default the
         highest that the path's limits allow everywhere.
     conditions
-        "simulation": perfect actuators and sensors.
+        "simulation" (perfect actuators, sensors, knowledge of the vehicle), "realtime" (our model
+        of a vehicle's runs), a `lpv_track_env.conditions.Conditions`, or a dictionary of its
+        fields, e.g. `{"name": "realtime", "estimator": "raw"}`. What is a range there is drawn for
+        every episode.
     control_period
         s; the dynamics are integrated with fixed Runge-Kutta steps of at most 5 ms within it.
     preview_steps, preview_period
@@ -133,7 +145,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         vehicle: str | Path | VehicleParameters = "m2-minibus",
         speed_mode: str = "variable",
         fixed_speed: float | None = None,
-        conditions: str = "simulation",
+        conditions: str | Conditions | dict[str, Any] = "simulation",
         control_period: float = 0.05,
         render_mode: str | None = None,
         *,
@@ -147,7 +159,6 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     ) -> None:
         if render_mode is not None:
             choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
-        self.conditions = choose("conditions", conditions, CONDITIONS)
         self.render_mode = render_mode
         self._speed = (speed_mode, fixed_speed)
         car = _load_vehicle(vehicle)
@@ -164,6 +175,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             time_limit=time_limit,
             initial_error_range=tuple(float(half) for half in initial_error_range),
             random_start=random_start,
+            conditions=load_conditions(conditions),
         )
         fps = max(round(1.0 / self.base_task.control_period), 1)
         self.metadata = {**self.metadata, "render_fps": fps}
@@ -172,7 +184,9 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.action_space = action_space([car])
         self._episode_data = np.zeros(kernels.OBSERVATION + self.base_task.layout.size // 2)
         self._running = False
+        self._draws = np.zeros(2, dtype=np.uint64)
         self._key, self._episode = np.uint64(0), -1
+        self._real: RealArrays | None = None
         self._renderer: Renderer | None = None
         self._open_views()
         self._use(self.base_task)
@@ -192,16 +206,20 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             return
         self.task = task
         self._constants[:] = task.constants()
+        self._real = RealArrays.of(task)
         self._take_table(task.path.table)
 
     def _take_table(self, table: NDArray[np.float64]) -> None:
         self._table = table
-        self._arguments = (self._episode_data, table)
+        self._arguments: tuple[NDArray[Any], ...] = (self._episode_data, table)
+        if self._real is not None:
+            self._arguments = (self._episode_data, table, *self._real, self._draws)
         self._advance: Callable[..., Any] = self._first_advance
 
-    def _first_advance(self, *arguments: NDArray[np.float64]) -> Any:
-        """Have `kernels.advance` compiled where it is needed, in a first step, and go there."""
-        self._advance = entry_point(kernels.advance, *arguments)
+    def _first_advance(self, *arguments: NDArray[Any]) -> Any:
+        """Have the kernel compiled where it is needed, in a first step, and go there."""
+        kernel = kernels.advance if self._real is None else real_env.advance_real
+        self._advance = entry_point(kernel, *arguments)
         return self._advance(*arguments)
 
     @property
@@ -218,6 +236,44 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def control_period(self) -> float:
         """Control period, s."""
         return self.task.control_period
+
+    @property
+    def conditions(self) -> Conditions | None:
+        """The conditions; None for "simulation"."""
+        return self.base_task.conditions
+
+    @property
+    def actuation(self) -> Actuation:
+        """Delays and lags between a command and its effect, as known beforehand (s)."""
+        return Actuation() if self.conditions is None else self.conditions.actuation
+
+    @property
+    def actuators(self) -> tuple[float, float]:
+        """Acceleration (m/s^2) and steering angle (rad) that the actuators have in force."""
+        return float(self._memory[kernels.ACCELERATION]), float(self._memory[kernels.STEERING])
+
+    def set_computing_time(self, latency: float, occupied: float | None = None) -> None:
+        """Say how long the next step's action took to compute, in place of `computing_delay`.
+
+        Parameters
+        ----------
+        latency
+            From the readings to the command, s.
+        occupied
+            How long the controller can take up nothing new, s; by default as long as that. A
+            pipeline of processes is busy for less than what passes through it takes.
+
+        Raises
+        ------
+        ValueError
+            Under conditions "simulation", where commands land at once, or for a negative time.
+        """
+        if self._real is None:
+            raise ValueError("conditions 'simulation' have no delays: make the env with others")
+        occupied = latency if occupied is None else occupied
+        if not (0.0 <= latency <= LONGEST_DELAY and 0.0 <= occupied <= LONGEST_DELAY):
+            raise ValueError(f"computing times must be 0 to {LONGEST_DELAY:g} s")
+        self._real.memory[real.LATENCY], self._real.memory[real.OCCUPIED] = latency, occupied
 
     @property
     def layout(self) -> ObservationLayout:
@@ -242,16 +298,26 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         super().reset(seed=seed)
         self._count_episode(reseeded=seed is not None)
         self._use(task)
-        episodes.begin(
-            self._memory, self._constants, self._table, self._observation,
-            self._key, self._episode, given,
-        )  # fmt: skip
+        if self._real is None:
+            episodes.begin(
+                self._memory, self._constants, self._table, self._observation,
+                self._key, self._episode, given,
+            )  # fmt: skip
+        else:
+            self._draws[:] = self._key, self._episode
+            real_env.begin_real(
+                self._real.memory, self._memory, self._real.spec, self._constants, self._table,
+                self._observation, self._draws, given,
+            )  # fmt: skip
         self._running = True
         if self._renderer is not None:
             self._renderer.begin(task)
         if self.render_mode == "human":
             self.render()
-        return self._observation.copy(), single_info(self._memory)
+        info = single_info(self._memory)
+        if self._real is not None:
+            info.update(self._real.info())
+        return self._observation.copy(), info
 
     def _count_episode(self, *, reseeded: bool) -> None:
         """Take a new key from `np_random` if it was seeded, else go on to the next episode."""
@@ -300,6 +366,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             terms["heading"], terms["speed"], terms["input_rate"], terms["end"],
         ) = self._advance(*self._arguments)  # fmt: skip
         info["state"] = self._state.copy()
+        if self._real is not None:
+            info.update(self._real.info())
         terminated = truncated = False
         if end:
             if end == kernels.NOT_FINITE:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env import filtering
-from lpv_track_env.task import longest_substep
+from lpv_track_env.bicycle import PSI, longest_substep
 from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]
@@ -181,9 +181,9 @@ class Estimator:
         m, states = self._memory, filtering.STATES
         m[:states] = [speed, 0.0, heading, 0.0, x, y, 0.0, 0.0, 0.0]
         covariance = np.diag(self.settings.initial_variances)
-        # The heading came from the sensor: its error is the bias, with the other sign.
-        psi, bias = filtering.PSI, filtering.HEADING_BIAS
-        covariance[psi, bias] = covariance[bias, psi] = -(self.settings.initial_heading_bias**2)
+        # The heading was read: its error is that of the bias, with the other sign.
+        covariance[PSI, filtering.HEADING_BIAS] -= self.settings.initial_heading_bias**2
+        covariance[filtering.HEADING_BIAS, PSI] -= self.settings.initial_heading_bias**2
         m[states : states + states**2] = covariance.ravel()
         filtering.begin_filter(m, float(time))
         self._begun = True
@@ -267,7 +267,7 @@ class Estimator:
     @property
     def position_deviation(self) -> float:
         """Standard deviation of the position in its worst direction, m."""
-        return float(filtering.position_deviation(self._memory))
+        return float(filtering.deviation_of(self._memory, 0))
 
     @property
     def fix_age(self) -> float:

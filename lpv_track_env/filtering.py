@@ -65,6 +65,30 @@ NUDGES = (1e-4, 1e-4, 1e-5, 1e-6)
 
 
 @compiled_internal
+def spread(m: Array, f: Array, fp: Array) -> None:
+    """Covariance P = F P F' with F = `f` (81,), P in the filter's memory; `fp` (81,) is scratch."""
+    # The three biases stay: their rows of F are those of the identity.
+    for i in range(6):
+        for j in range(STATES):
+            total = 0.0
+            for k in range(STATES):
+                total += f[i * STATES + k] * m[COVARIANCE + k * STATES + j]
+            fp[i * STATES + j] = total
+    for i in range(6, STATES):
+        for j in range(STATES):
+            fp[i * STATES + j] = m[COVARIANCE + i * STATES + j]
+    for i in range(STATES):
+        for j in range(i + 1):
+            total = fp[i * STATES + j]
+            if j < 6:
+                total = 0.0
+                for k in range(STATES):
+                    total += fp[i * STATES + k] * f[j * STATES + k]
+            m[COVARIANCE + i * STATES + j] = total
+            m[COVARIANCE + j * STATES + i] = total
+
+
+@compiled_internal
 def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array) -> None:
     """Predict state and covariance of a filter's memory by dt seconds, inputs held.
 
@@ -76,7 +100,7 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
         s[PARAMETERS], s[PARAMETERS + 1], s[PARAMETERS + 2], s[PARAMETERS + 3],
         s[PARAMETERS + 4], s[PARAMETERS + 5], s[PARAMETERS + 6],
     )  # fmt: skip
-    substeps = max(int(math.ceil(dt / s[SUBSTEP] - 1e-9)), 1)
+    substeps = max(math.ceil(dt / s[SUBSTEP] - 1e-9), 1)
     h = dt / substeps
     vx, vy, psi, r = m[VX], m[VY], m[PSI], m[YAW_RATE]
     wheels = delta + m[STEERING_OFFSET]
@@ -112,26 +136,7 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
     m[PSI] = psi + turn
     m[X] += dx
     m[Y] += dy
-    # P = F P F' + Q dt; the three biases stay, so their rows of F are those of the identity.
-    fp = work[81:162]
-    for i in range(6):
-        for j in range(STATES):
-            total = 0.0
-            for k in range(STATES):
-                total += f[i * STATES + k] * m[COVARIANCE + k * STATES + j]
-            fp[i * STATES + j] = total
-    for i in range(6, STATES):
-        for j in range(STATES):
-            fp[i * STATES + j] = m[COVARIANCE + i * STATES + j]
-    for i in range(STATES):
-        for j in range(i + 1):
-            total = fp[i * STATES + j]
-            if j < 6:
-                total = 0.0
-                for k in range(STATES):
-                    total += fp[i * STATES + k] * f[j * STATES + k]
-            m[COVARIANCE + i * STATES + j] = total
-            m[COVARIANCE + j * STATES + i] = total
+    spread(m, f, work[81:162])
     d = COVARIANCE
     m[d] += s[VX_DENSITY] * dt
     m[d + 10 * VY] += s[VY_DENSITY] * dt
@@ -243,6 +248,13 @@ def keep(m: Array, nodes: Array, k: int) -> None:
     """Write state and covariance into node k."""
     for j in range(STATES + 81):
         nodes[k * NODE + NODE_STATE + j] = m[j]
+
+
+@compiled_internal
+def correlate(m: Array, state: int, bias: int) -> None:
+    """Say that a state was read by a sensor whose bias is `bias`: their errors are opposite."""
+    variance = m[COVARIANCE + 10 * bias]
+    m[COVARIANCE + state * STATES + bias] = m[COVARIANCE + bias * STATES + state] = -variance
 
 
 @compiled
@@ -370,3 +382,9 @@ def position_deviation(m: Array) -> Any:
     d = COVARIANCE
     xx, yy, xy = m[d + 10 * X], m[d + 10 * Y], m[d + X * STATES + Y]
     return math.sqrt(0.5 * (xx + yy) + math.sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy))
+
+
+@compiled
+def deviation_of(memory: Array, start: int) -> Any:
+    """`position_deviation` of the filter that begins at `start` in a memory."""
+    return position_deviation(memory[start:])

@@ -1,6 +1,5 @@
 """What an environment is made for: path, vehicle, periods, limits, as its kernels take them."""
 
-import difflib
 import math
 import warnings
 from collections.abc import Sequence
@@ -12,7 +11,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 import trajectories
-from lpv_track_env.bicycle import fastest_pole
+from lpv_track_env.bicycle import longest_substep
+from lpv_track_env.conditions import Conditions
+from lpv_track_env.naming import choose
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.vehicle import VehicleParameters
@@ -21,21 +22,8 @@ from trajectories.projection import tightest_turn
 from trajectories.speed import constant_speed
 
 SPEED_MODES = ("variable", "fixed")
-CONDITIONS = ("simulation",)
-LONGEST_SUBSTEP = 0.005
-"""s; shortened where the vehicle's fastest pole at standstill asks for it."""
-POLE_STEP = 1.5
-"""Largest product of substep and pole; Runge-Kutta's stability ends at 2.78."""
 
 Array = NDArray[np.float64]
-
-
-def choose(kind: str, value: str, known: tuple[str, ...]) -> str:
-    """Return `value` if known, else raise a ValueError listing the known ones and the nearest."""
-    if value in known:
-        return value
-    nearest = difflib.get_close_matches(str(value), known, n=1, cutoff=0.0)[0]
-    raise ValueError(f"unknown {kind} {value!r}; known: {', '.join(known)} (nearest: {nearest})")
 
 
 def checked_period(value: float) -> float:
@@ -44,11 +32,6 @@ def checked_period(value: float) -> float:
     if not 0.001 <= period <= 1.0:
         raise ValueError(f"control_period must be in [0.001, 1] s, not {value}")
     return period
-
-
-def longest_substep(vehicle: VehicleParameters) -> float:
-    """Longest step of the integration that resolves a vehicle's dynamics at any speed, s."""
-    return min(LONGEST_SUBSTEP, POLE_STEP / fastest_pole(0.0, vehicle))
 
 
 def reference(
@@ -101,6 +84,8 @@ class Task:
     time_limit: float | None
     initial_error_range: tuple[float, ...] = (0.0, 0.0, 0.0)
     random_start: bool = False
+    conditions: Conditions | None = None
+    """None: the ideal ones, `simulation`."""
 
     def __post_init__(self) -> None:
         checked_period(self.control_period)

@@ -16,8 +16,9 @@ from lpv_track_env import kernels, vector_kernels
 from lpv_track_env.draws import random_key
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.episodes import GIVEN, given_start
+from lpv_track_env.naming import choose
 from lpv_track_env.reward import RewardWeights
-from lpv_track_env.task import Task, action_space, choose
+from lpv_track_env.task import Task, action_space
 from lpv_track_env.threads import checked_threads, shares, using_threads
 from lpv_track_env.vector_infos import episode_infos, final_infos
 from lpv_track_env.vehicle import VehicleParameters

@@ -22,7 +22,7 @@ def test_mixing_function_is_that_of_splitmix64() -> None:
         assert int(draws.mix(np.uint64(state))) == wanted
 
 
-def draws(key: int, count: int, draws_each: int = 6) -> np.ndarray:
+def drawn(key: int, count: int, draws_each: int = 6) -> np.ndarray:
     return np.array(
         [
             [draws.uniform(np.uint64(key), episode, draw) for draw in range(draws_each)]
@@ -32,7 +32,7 @@ def draws(key: int, count: int, draws_each: int = 6) -> np.ndarray:
 
 
 def test_draws_are_uniform_and_independent() -> None:
-    values = np.concatenate([draws(key, 500) for key in (0, 1, 2, 2**64 - 1)])
+    values = np.concatenate([drawn(key, 500) for key in (0, 1, 2, 2**64 - 1)])
     assert values.min() >= 0.0
     assert values.max() < 1.0
     n = values.size

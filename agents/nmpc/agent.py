@@ -12,8 +12,8 @@ from agents.nmpc.casadi_solver import CasadiSolver
 from agents.nmpc.fatrop_solver import FatropSolver
 from agents.nmpc.problem import Solution, Status
 from agents.weights import TrackingWeights, WeightSchedule
+from lpv_track_env.naming import choose
 from lpv_track_env.observation import TrackingObservation
-from lpv_track_env.task import choose
 from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]

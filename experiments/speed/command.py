@@ -26,7 +26,7 @@ from experiments.results import hardware, revision, versions
 from experiments.speed import environments, learning, loops, processes, solvers, tables, wild
 from experiments.speed.figures import picture
 from experiments.speed.measure import FULL, QUICK, Effort, Section, Tick
-from lpv_track_env.task import choose
+from lpv_track_env.naming import choose
 from trajectories.atomic import write_atomically
 
 FORMAT = "lpv-track-speed/1"

@@ -1,0 +1,150 @@
+"""Memory of a vehicle under conditions other than ideal, and how conditions reach the kernels.
+
+`real` is one float64 array a vehicle: what its `conditions` were drawn to, actuators, commands on
+their way, wind, sensors, the estimate as a memory of its own (`kernels`), the filter (`filtering`).
+`spec` is one float64 array an environment: the ranges to draw from, settings, sizes.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lpv_track_env import filtering, kernels
+from lpv_track_env.conditions import DRAWN, ESTIMATORS, Conditions
+from lpv_track_env.task import Task
+from lpv_track_env.vehicle import PARAMETER_ORDER, VehicleParameters
+
+Array = NDArray[np.float64]
+
+COUNT = len(DRAWN)
+(
+    GNSS_LATENCY, GNSS_NOISE, GNSS_WANDER, GNSS_WANDER_TIME, GNSS_DROPOUT_RATE,
+    GNSS_DROPOUT_DURATION, GNSS_OUTLIER_RATE, GNSS_OUTLIER_SIZE, HEADING_NOISE, HEADING_BIAS,
+    YAW_RATE_NOISE, YAW_RATE_BIAS, YAW_RATE_DRIFT, SPEED_NOISE, SPEED_SCALE, STEERING_LAG,
+    STEERING_DEAD_TIME, STEERING_OFFSET, DRIVE_LAG, DRIVE_DEAD_TIME, MASS_FACTOR, INERTIA_FACTOR,
+    FRONT_STIFFNESS_FACTOR, REAR_STIFFNESS_FACTOR, ROLLING_FACTOR, FRICTION, WIND_SPEED,
+    GUST_SPEED, GUST_TIME, SIDE_AREA, COMPUTING_DELAY,
+) = range(COUNT)  # fmt: skip
+"""The memory begins with what was drawn, in the order of `conditions.DRAWN`; then"""
+PLANT = COUNT
+"""the true vehicle's parameters, 7 in `PARAMETER_ORDER`;"""
+(
+    SERVO_A, SERVO_DELTA, COMMAND_A, COMMAND_DELTA, NEWEST, QUEUED, FREE_AT, LATENCY,
+    OCCUPIED, MISSES, STOPPING, MEAN_A, MEAN_DELTA, WIND_X, WIND_Y, GUST, WANDER_X, WANDER_Y,
+    OUTAGE_END, NEXT_FIX, WAITING, DRIFT, FIX_X, FIX_Y, READ_SPEED, READ_YAW_RATE, READ_HEADING,
+) = range(PLANT + len(PARAMETER_ORDER), PLANT + len(PARAMETER_ORDER) + 27)  # fmt: skip
+"""actuators as they report (a, delta), last accepted command, places in the queue of commands, when
+the controller is free again (s), latency and occupation of the
+next computation if somebody measured them (s, else -1), deadline misses, whether it brakes to a
+stop, mean reported inputs over the last period, the wind's direction and gust, GNSS, the readings
+of this period;"""
+ESTIMATE = PLANT + len(PARAMETER_ORDER) + 27
+"""the estimate, a memory as `kernels` has it;"""
+TAIL = ESTIMATE + kernels.MEMORY_SIZE
+"""commands on their way (landing time s, a, delta), fixes on theirs (arrival s, stamp, x, y), and
+the filter with its past."""
+COMMAND, WAY = 3, 4
+"""Numbers of a command and of a fix on its way."""
+
+# A spec holds the ranges of what is drawn, (COUNT, 2), then
+RANGES = 0
+GNSS_PERIOD = 2 * COUNT
+MAX_FIX_AGE, MAX_COMMAND_AGE, ESTIMATOR, CALIBRATE = (
+    GNSS_PERIOD + 1, GNSS_PERIOD + 2, GNSS_PERIOD + 3, GNSS_PERIOD + 4,
+)  # fmt: skip
+QUEUE_ROOM, FIX_ROOM = GNSS_PERIOD + 5, GNSS_PERIOD + 6
+INITIAL = GNSS_PERIOD + 7
+"""the filter's initial variances, (9,), and its settings."""
+SETTINGS = INITIAL + filtering.STATES
+SPEC = SETTINGS + filtering.SETTINGS
+
+EKF, RAW, TRUTH = range(len(ESTIMATORS))
+WORST_OFFSET = 0.1
+"""rad; a larger estimate of the steering offset is not believed."""
+
+
+def rooms(conditions: Conditions, period: float) -> tuple[int, int, int]:
+    """Numbers of commands and of fixes on their way, and of the filter's nodes, that may be."""
+    slowest = conditions.ends("computing_delay")[1] + max(
+        conditions.ends("steering_dead_time")[1], conditions.ends("drive_dead_time")[1]
+    )
+    latest = conditions.ends("gnss_latency")[1]
+    # Beside the commands on their way: the one in force, the next, and what is late if somebody
+    # measured a time that the conditions do not know of.
+    return (
+        math.ceil(slowest / period) + 8,
+        math.ceil(latest / conditions.gnss_period) + 2,
+        math.ceil(latest / period) + 2 if conditions.estimator == "ekf" else 1,
+    )
+
+
+def memory_size(conditions: Conditions, period: float) -> int:
+    """Length of a vehicle's `real` under some conditions and a control period (s)."""
+    commands, fixes, nodes = rooms(conditions, period)
+    return TAIL + COMMAND * commands + WAY * fixes + filtering.FILTER + filtering.NODE * nodes
+
+
+def spec_of(conditions: Conditions, vehicle: VehicleParameters, period: float) -> Array:
+    """Numbers as the kernels take them, shape (SPEC,), for a vehicle and a control period (s)."""
+    age = conditions.max_command_age
+    commands, fixes, _ = rooms(conditions, period)
+    return np.concatenate(
+        [
+            conditions.ranges().ravel(),
+            [
+                conditions.gnss_period,
+                conditions.max_fix_age,
+                3.0 * period if age is None else age,
+                ESTIMATORS.index(conditions.estimator),
+                float(conditions.calibrate_steering),
+                commands,
+                fixes,
+            ],
+            conditions.estimator_settings.initial_variances,
+            conditions.estimator_settings.as_array(vehicle),
+        ]
+    )
+
+
+class RealArrays(NamedTuple):
+    """What the kernels take of one vehicle under conditions."""
+
+    memory: Array
+    spec: Array
+    work: Array
+    """Working space of the filter."""
+
+    @classmethod
+    def of(cls, task: Task) -> "RealArrays | None":
+        """Arrays for a task; None under conditions `simulation`."""
+        if task.conditions is None:
+            return None
+        return cls(
+            np.zeros(memory_size(task.conditions, task.control_period)),
+            spec_of(task.conditions, task.vehicle, task.control_period),
+            np.zeros(filtering.WORK),
+        )
+
+    def info(self) -> dict[str, Any]:
+        """What infos have besides those of ideal conditions."""
+        return info_of(self.memory, self.spec)
+
+
+def filter_start(spec: Array) -> int:
+    """Where in a vehicle's memory the filter's begins."""
+    return TAIL + COMMAND * int(spec[QUEUE_ROOM]) + WAY * int(spec[FIX_ROOM])
+
+
+def info_of(memory: Array, spec: Array) -> dict[str, Any]:
+    """Infos of one vehicle: estimate (6,), position_deviation, stopping, deadline_misses."""
+    deviation = math.nan
+    if spec[ESTIMATOR] == EKF:
+        deviation = filtering.deviation_of(memory, filter_start(spec))
+    return {
+        "estimate": memory[ESTIMATE : ESTIMATE + 6].copy(),
+        "position_deviation": deviation,
+        "stopping": bool(memory[STOPPING]),
+        "deadline_misses": int(memory[MISSES]),
+    }

@@ -1,0 +1,155 @@
+"""Compiled kernels of path tracking under conditions: one vehicle's period, beginnings, many.
+
+What an agent sees is made of the estimate; reward, ends and infos are made of the truth.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lpv_track_env import filtering, real
+from lpv_track_env import kernels as k
+from lpv_track_env.draws import gaussian, uniform
+from lpv_track_env.episodes import begin
+from lpv_track_env.real_sensors import (
+    begin_estimate,
+    estimate,
+    offset_of,
+    read_sensors,
+    receive_satellites,
+)
+from lpv_track_env.real_vehicle import blow, command_age, move, send
+from trajectories.compilation import compiled, compiled_internal
+from trajectories.projection import SEARCH_WINDOW
+
+Array = NDArray[Any]
+
+CONDITIONS_DRAW, DIRECTION_DRAW, WANDER_DRAW, GUST_DRAW, PHASE_DRAW = 16, 80, 82, 84, 86
+"""Places of an episode's draws, see `episodes`; from PERIOD_DRAW on, those of its periods."""
+PERIOD_DRAW, DRAWS = 128, 64
+
+
+@compiled_internal
+def drive_real(
+    m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array, table: Array,
+    observation: Array, key: Any, episode: Any, work: Array,
+) -> int:  # fmt: skip
+    """One control period of an episode under conditions, in place; the code of its end."""
+    p = constants
+    fixes = real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM])
+    filtered = fixes + real.WAY * int(spec[real.FIX_ROOM])
+    queue, ways, filter_memory = m[real.TAIL : fixes], m[fixes:filtered], m[filtered:]
+    now = memory[k.STEPS] * p[k.PERIOD]
+    draw = PERIOD_DRAW + DRAWS * (int(memory[k.STEPS]) + 1)
+    a, delta, bits = k.actuate(
+        a, delta, m[real.COMMAND_A], m[real.COMMAND_DELTA],
+        p[k.MAX_STEERING], p[k.STEERING_STEP], p[k.LOWEST_ACCELERATION], p[k.HIGHEST_ACCELERATION],
+        p[k.ACCELERATION_STEP],
+    )  # fmt: skip
+    send(m, queue, now, a, delta, offset_of(filter_memory, spec))
+    blind = (
+        spec[real.ESTIMATOR] == real.EKF
+        and filter_memory[filtering.FIX_AGE] > spec[real.MAX_FIX_AGE]
+    )
+    stale = command_age(m, queue, now) > spec[real.MAX_COMMAND_AGE] + 1e-9
+    m[real.STOPPING] = 1.0 if blind or stale else 0.0
+    blow(m, key, episode, draw, p[k.PERIOD])
+    vx, vy, psi, r, x, y = move(m, queue, memory, p, now)
+    end = k.finish(
+        memory, p, table, observation, vx, vy, psi, r, x, y, m[real.SERVO_A],
+        m[real.SERVO_DELTA], bits,
+    )  # fmt: skip
+    if end == k.NON_FINITE:
+        # What was seen last stays: there is no state that sensors could read.
+        return end
+    now = memory[k.STEPS] * p[k.PERIOD]
+    read_sensors(m, memory, key, episode, draw, p[k.PERIOD])
+    receive_satellites(m, ways, memory, now, key, episode, draw, spec)
+    estimate(m, ways, filter_memory, memory, now, spec, work)
+    see(m, p, table, observation, vx * p[k.PERIOD])
+    return end
+
+
+@compiled_internal
+def see(m: Array, constants: Array, table: Array, observation: Array, ahead: Any) -> None:
+    """Find the estimate on the path and make the observation of it."""
+    # A fix may move the estimate by more than the vehicle drives in a period.
+    window = min(max(SEARCH_WINDOW, 1.5 * abs(ahead)), constants[k.LENGTH])
+    k.look(m[real.ESTIMATE : real.TAIL], constants, table, observation, ahead, window)
+
+
+@compiled
+def begin_real(
+    m: Array, memory: Array, spec: Array, constants: Array, table: Array, observation: Array,
+    draws: Array, given: Array,
+) -> None:  # fmt: skip
+    """Begin an episode under conditions: draw them and the start, `given` as `episodes.begin`.
+
+    `draws` holds key and number of the episode, (2,) uint64.
+    """
+    key, episode = draws[0], draws[1]
+    begin(memory, constants, table, observation, key, episode, given)
+    for j in range(m.shape[0]):
+        m[j] = 0.0
+    for j in range(real.COUNT):
+        low, high = spec[2 * j], spec[2 * j + 1]
+        m[j] = low
+        if high > low:
+            m[j] += (high - low) * uniform(key, episode, CONDITIONS_DRAW + j)
+    for j in range(7):
+        m[real.PLANT + j] = constants[j]
+    m[real.PLANT] *= m[real.MASS_FACTOR]
+    m[real.PLANT + 1] *= m[real.INERTIA_FACTOR]
+    m[real.PLANT + 4] *= m[real.FRONT_STIFFNESS_FACTOR]
+    m[real.PLANT + 5] *= m[real.REAR_STIFFNESS_FACTOR]
+    m[real.PLANT + 6] *= m[real.ROLLING_FACTOR]
+    direction = 2.0 * math.pi * uniform(key, episode, DIRECTION_DRAW)
+    m[real.WIND_X], m[real.WIND_Y] = math.cos(direction), math.sin(direction)
+    first, second = gaussian(key, episode, WANDER_DRAW)
+    m[real.WANDER_X], m[real.WANDER_Y] = m[real.GNSS_WANDER] * first, m[real.GNSS_WANDER] * second
+    first, second = gaussian(key, episode, GUST_DRAW)
+    m[real.GUST] = m[real.GUST_SPEED] * first
+    # Receivers do not start with the drive.
+    m[real.NEXT_FIX] = spec[real.GNSS_PERIOD] * uniform(key, episode, PHASE_DRAW)
+    m[real.LATENCY] = m[real.OCCUPIED] = -1.0
+    m[real.SERVO_A], m[real.SERVO_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]
+    m[real.COMMAND_A], m[real.COMMAND_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]
+    m[real.TAIL] = 0.0
+    m[real.TAIL + 1], m[real.TAIL + 2] = memory[k.ACCELERATION], memory[k.STEERING]
+    m[real.QUEUED] = 1.0
+    filtered = (
+        real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM]) + real.WAY * int(spec[real.FIX_ROOM])
+    )
+    begin_estimate(m, m[filtered:], memory, key, episode, PERIOD_DRAW, spec)
+    e = m[real.ESTIMATE : real.TAIL]
+    e[k.ACCELERATION], e[k.STEERING] = memory[k.ACCELERATION], memory[k.STEERING]
+    if spec[real.ESTIMATOR] == real.TRUTH:
+        e[k.STEERING] += m[real.STEERING_OFFSET]
+    e[k.ARC_LENGTH] = memory[k.ARC_LENGTH]
+    see(m, constants, table, observation, 0.0)
+
+
+@compiled
+def advance_real(
+    data: Array, table: Array, m: Array, spec: Array, work: Array, draws: Array
+) -> tuple[int, Any, Any, Any, Any, int, Any, Any, Any, Any, Any, Any, Any]:
+    """`kernels.advance` under conditions: one period of a single environment, in place.
+
+    `draws` holds key and number of the episode, (2,) uint64.
+    """
+    a, delta = data[0], data[1]
+    c = data[k.MEMORY : k.CONSTANTS]
+    if math.isfinite(a) and math.isfinite(delta):
+        end = drive_real(
+            m, c, a, delta, spec, data[k.CONSTANTS : k.OBSERVATION], table,
+            data[k.OBSERVATION :].view(np.float32), draws[0], draws[1], work,
+        )  # fmt: skip
+    else:
+        end = k.NOT_FINITE
+    j = k.TERMS
+    return (
+        end, c[k.ARC_LENGTH], c[k.LATERAL_ERROR], c[k.HEADING_ERROR], c[k.SPEED_ERROR],
+        int(c[k.CLIPPED]), c[k.REWARD], c[j], c[j + 1], c[j + 2], c[j + 3], c[j + 4], c[j + 5],
+    )  # fmt: skip

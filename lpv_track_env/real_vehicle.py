@@ -1,0 +1,189 @@
+"""Compiled kernels of a real vehicle: late commands, lagging actuators, other tyres, wind."""
+
+import math
+from typing import Any
+
+from numpy.typing import NDArray
+
+from lpv_track_env import kernels as k
+from lpv_track_env import real
+from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, compiled_inverse_speed
+from lpv_track_env.conditions import WIND_LEVER
+from lpv_track_env.draws import gaussian
+from lpv_track_env.integration import integrate
+from lpv_track_env.vehicle import GRAVITY
+from trajectories.compilation import compiled_internal
+
+Array = NDArray[Any]
+
+AIR_DENSITY = 1.225
+"""kg/m^3, standard atmosphere at sea level."""
+GUST_DRAW = 32
+"""Place of the gust's draw among those of a control period, see `real_sensors`."""
+STOP_DECELERATION = 2.0
+"""m/s^2 of the brakes when the vehicle stops by itself; `agents.base` stops likewise."""
+
+
+@compiled_internal
+def send(m: Array, queue: Array, now: Any, a: Any, delta: Any, offset: Any) -> None:
+    """Send a command computed from readings at `now`, its steering less an offset: it lands later.
+
+    A controller that is still busy with an earlier one misses its turn: the command is dropped.
+    """
+    latency, occupied = m[real.LATENCY], m[real.OCCUPIED]
+    if latency < 0.0:
+        latency = m[real.COMPUTING_DELAY]
+    if occupied < 0.0:
+        occupied = latency
+    m[real.LATENCY] = m[real.OCCUPIED] = -1.0
+    if m[real.FREE_AT] > now + 1e-9:
+        m[real.MISSES] += 1.0
+        return
+    m[real.FREE_AT] = now + occupied
+    m[real.COMMAND_A], m[real.COMMAND_DELTA] = a, delta
+    landing = now + latency
+    room = queue.shape[0] // real.COMMAND
+    newest = int(m[real.NEWEST])
+    # One that lands before those sent earlier takes their place.
+    while m[real.QUEUED] > 1.0 and queue[newest * real.COMMAND] >= landing:
+        newest = (newest - 1 + room) % room
+        m[real.QUEUED] -= 1.0
+    newest = (newest + 1) % room
+    queue[newest * real.COMMAND] = landing
+    queue[newest * real.COMMAND + 1] = a
+    queue[newest * real.COMMAND + 2] = delta - offset
+    m[real.NEWEST] = newest
+    m[real.QUEUED] = min(m[real.QUEUED] + 1.0, float(room))
+
+
+@compiled_internal
+def held(m: Array, queue: Array, entry: int, begins: Any, ends: Any) -> Any:
+    """Mean of a command's entry (1: a, 2: delta) over a time, s, as it came in."""
+    room = queue.shape[0] // real.COMMAND
+    at, left = int(m[real.NEWEST]), int(m[real.QUEUED])
+    total, end, value = 0.0, ends, 0.0
+    while left > 0 and end > begins:
+        value = queue[at * real.COMMAND + entry]
+        landing = queue[at * real.COMMAND]
+        if landing < end:
+            start = max(landing, begins)
+            total += (end - start) * value
+            end = start
+        at, left = (at - 1 + room) % room, left - 1
+    if end > begins:
+        total += (end - begins) * value
+    return total / (ends - begins)
+
+
+@compiled_internal
+def secant(stiffness: Any, slip: Any, limit: Any) -> Any:
+    """Lateral force per slip angle at a slip (rad), up to `limit` (N): the brush model's.
+
+    F = C a (1 - z + z^2/3) with z = C |a| / (3 limit) up to z = 1, where all slides. (Pacejka, Tire
+    and Vehicle Dynamics, section 3.2, parabolic pressure.)
+    """
+    if not math.isfinite(limit):
+        return stiffness
+    z = stiffness * abs(slip) / (3.0 * limit)
+    if z < 1.0:
+        return stiffness * (1.0 - z + z * z / 3.0)
+    return limit / abs(slip)
+
+
+@compiled_internal
+def blow(m: Array, key: Any, episode: Any, draw: int, period: Any) -> None:
+    """Let the wind's gust go on by a period: first order, of stationary deviation."""
+    kept = math.exp(-period / m[real.GUST_TIME])
+    first, _ = gaussian(key, episode, draw + GUST_DRAW)
+    m[real.GUST] = kept * m[real.GUST] + m[real.GUST_SPEED] * math.sqrt(1.0 - kept * kept) * first
+
+
+@compiled_internal
+def side_wind(m: Array, vx: Any, vy: Any, psi: Any) -> tuple[Any, Any]:
+    """Lateral (m/s^2) and yaw acceleration (rad/s^2) by the wind.
+
+    F = rho/2 A |v| v_y with the air's velocity v in the body's frame: the side force coefficient
+    goes with the sine of the flow's angle.
+    """
+    c, s = math.cos(psi), math.sin(psi)
+    wind = m[real.WIND_SPEED] + m[real.GUST]
+    wx, wy = wind * m[real.WIND_X], wind * m[real.WIND_Y]
+    ahead, aside = c * wx + s * wy - vx, c * wy - s * wx - vy
+    flow = math.sqrt(ahead * ahead + aside * aside)
+    force = 0.5 * AIR_DENSITY * m[real.SIDE_AREA] * flow * aside
+    return force / m[real.PLANT], force * WIND_LEVER / m[real.PLANT + 1]
+
+
+@compiled_internal
+def command_age(m: Array, queue: Array, now: Any) -> Any:
+    """Time since the command in force came in, s."""
+    room = queue.shape[0] // real.COMMAND
+    at, left = int(m[real.NEWEST]), int(m[real.QUEUED])
+    while left > 1 and queue[at * real.COMMAND] > now:
+        at, left = (at - 1 + room) % room, left - 1
+    return now - queue[at * real.COMMAND]
+
+
+@compiled_internal
+def stop_acceleration(m: Array, constants: Array) -> Any:
+    """Acceleration that brakes to a stop by the estimated speed, within the jerk limit, m/s^2."""
+    speed = max(m[real.ESTIMATE + VX], 0.0)
+    jerk = constants[k.ACCELERATION_STEP] / constants[k.PERIOD]
+    # Half the jerk limit brings deceleration and speed to zero together.
+    braking = min(STOP_DECELERATION, math.sqrt(jerk * speed))
+    return max(constants[6] - braking, m[real.SERVO_A] - constants[k.ACCELERATION_STEP])
+
+
+@compiled_internal
+def move(m: Array, queue: Array, memory: Array, constants: Array, now: Any) -> tuple[
+    Any, Any, Any, Any, Any, Any
+]:  # fmt: skip
+    """State after a control period of the real vehicle; notes servos and mean inputs in `m`."""
+    p, q = constants, real.PLANT
+    substeps = int(p[k.SUBSTEPS])
+    h = p[k.PERIOD] / substeps
+    drive_lag, steering_lag = m[real.DRIVE_LAG], m[real.STEERING_LAG]
+    drive_kept = math.exp(-h / drive_lag) if drive_lag > 0.0 else 0.0
+    steering_kept = math.exp(-h / steering_lag) if steering_lag > 0.0 else 0.0
+    vx, vy, psi, r = memory[VX], memory[VY], memory[PSI], memory[YAW_RATE]
+    x, y = memory[X], memory[Y]
+    servo_a, servo_delta = m[real.SERVO_A], m[real.SERVO_DELTA]
+    wheelbase = m[q + 2] + m[q + 3]
+    load = m[q] * GRAVITY / wheelbase * m[real.FRICTION]
+    total_a = total_delta = 0.0
+    windy = m[real.WIND_SPEED] > 0.0 or m[real.GUST_SPEED] > 0.0
+    stopping = m[real.STOPPING] > 0.5
+    braking = stop_acceleration(m, p) if stopping else 0.0
+    for i in range(substeps):
+        begins = now + i * h
+        ends = begins + h
+        dead = m[real.DRIVE_DEAD_TIME]
+        wanted = braking if stopping else held(m, queue, 1, begins - dead, ends - dead)
+        # Mean of the first-order response over the step: the integrator holds its inputs.
+        a = wanted + (servo_a - wanted) * ((1.0 - drive_kept) * drive_lag / h)
+        servo_a = wanted + (servo_a - wanted) * drive_kept
+        dead = m[real.STEERING_DEAD_TIME]
+        wanted = held(m, queue, 2, begins - dead, ends - dead)
+        delta = wanted + (servo_delta - wanted) * ((1.0 - steering_kept) * steering_lag / h)
+        servo_delta = wanted + (servo_delta - wanted) * steering_kept
+        total_a += a
+        total_delta += delta
+        wheels = delta + m[real.STEERING_OFFSET]
+        inverse = compiled_inverse_speed(vx)
+        front = wheels * (vx * inverse) - (vy + m[q + 2] * r) * inverse
+        rear = (m[q + 3] * r - vy) * inverse
+        push = spin = 0.0
+        if windy:
+            push, spin = side_wind(m, vx, vy, psi)
+        # Half the wind's push before and half after the step (Strang): second order.
+        vx, vy, psi, r, x, y = integrate(
+            vx, vy + 0.5 * h * push, psi, r + 0.5 * h * spin, x, y, a / m[real.MASS_FACTOR], wheels,
+            m[q], m[q + 1], m[q + 2], m[q + 3],
+            secant(m[q + 4], front, load * m[q + 3]), secant(m[q + 5], rear, load * m[q + 2]),
+            m[q + 6], h, 1,
+        )  # fmt: skip
+        vy += 0.5 * h * push
+        r += 0.5 * h * spin
+    m[real.SERVO_A], m[real.SERVO_DELTA] = servo_a, servo_delta
+    m[real.MEAN_A], m[real.MEAN_DELTA] = total_a / substeps, total_delta / substeps
+    return vx, vy, psi, r, x, y
