@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from lpv_track_env.conditions import Actuation
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
@@ -21,6 +22,7 @@ from trajectories import ReferencePath
 Action = NDArray[np.float32]
 Memory = TypeVar("Memory")
 
+NOTHING_DELAYED = Actuation()
 STOP_DECELERATION = 2.0
 """m/s^2 of a controlled stop."""
 
@@ -55,6 +57,8 @@ class DrivingTask:
     vehicle: VehicleParameters
     control_period: float
     path: ReferencePath
+    actuation: Actuation = NOTHING_DELAYED
+    """Delays and lags between a command and its effect, nominal (s)."""
 
     @classmethod
     def of(cls, env: gymnasium.Env[Any, Any]) -> "DrivingTask":
@@ -67,7 +71,13 @@ class DrivingTask:
         """
         inner = env.unwrapped
         try:
-            return cls(inner.layout, inner.vehicle, inner.control_period, inner.path)  # type: ignore[attr-defined]
+            return cls(
+                inner.layout,
+                inner.vehicle,
+                inner.control_period,
+                inner.path,
+                inner.actuation,  # type: ignore[attr-defined]
+            )
         except AttributeError as error:
             raise TypeError(
                 f"{type(inner).__name__} is not a path tracking environment: {error}"

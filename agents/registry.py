@@ -27,6 +27,10 @@ REGISTRY: dict[str, str] = {
 """Name -> "module:Class"; the class takes a `DrivingTask` and its own keyword settings."""
 
 
+COMMON = ("delay_compensation",)
+"""Settings that `make` itself takes, for every agent."""
+
+
 def names() -> list[str]:
     """Names that `make` knows."""
     return list(REGISTRY)
@@ -102,14 +106,31 @@ def check_settings(name: str, settings: Iterable[str]) -> None:
         return
     known = [parameter.name for parameter in parameters]
     for key in settings:
-        if key not in known:
+        if key not in (*known, *COMMON):
             nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
             hint = f"; known: {', '.join(known)} (nearest: {nearest[0]})" if nearest else ""
             raise ValueError(f"agent {name!r} has no setting {key!r}{hint}")
 
 
-def make(name: str, env: gymnasium.Env[Any, Any], **settings: Any) -> Agent:
+def make(
+    name: str,
+    env: gymnasium.Env[Any, Any],
+    *,
+    delay_compensation: bool | None = None,
+    **settings: Any,
+) -> Agent:
     """Make an agent for an environment; `settings` are its class's keyword arguments.
+
+    Parameters
+    ----------
+    name
+        As `names` lists it, or "module:Class" or "file.py:Class".
+    env
+        What it will drive, wrapped or not.
+    delay_compensation
+        Whether it is shown the observation of the time at which its action lands
+        (`agents.delay.DelayCompensated`); by default where the environment's conditions have
+        delays.
 
     Raises
     ------
@@ -118,8 +139,14 @@ def make(name: str, env: gymnasium.Env[Any, Any], **settings: Any) -> Agent:
     """
     cls = agent_class(name)
     check_settings(name, settings)
+    task = DrivingTask.of(env)
     try:
-        agent: Agent = cls(DrivingTask.of(env), **settings)
+        agent: Agent = cls(task, **settings)
     except TypeError as error:
         raise ValueError(f"agent {name!r}: {error}") from error
+    delayed = any(time > 0.0 for time in task.actuation)
+    if delayed if delay_compensation is None else delay_compensation:
+        from agents.delay import DelayCompensated
+
+        agent = DelayCompensated(agent, task, task.actuation, settings.get("model"))
     return agent
