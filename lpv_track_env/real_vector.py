@@ -144,14 +144,14 @@ class RealVector:
         """Drive a control period; `arguments` are `advance`'s from `memories` on."""
         self.draws[:, 0], self.draws[:, 1] = keys, episodes
         n = len(self.draws)
-        given: Any = (
-            mode, *arguments, self.reals, self.specs, self.draws, self._final_reports,
-        )  # fmt: skip
+        shared = (mode, *arguments, self.reals, self.specs, self.draws, self._final_reports)
         if self._threads == 1:
-            advance(0, n, *given, self._work[0])
+            alone: Any = (0, n, *shared, self._work[0])
+            advance(*alone)
         else:
+            chunked: Any = (len(self._work), n, *shared, self._work)
             with using_threads(self._threads):
-                advance_in_threads(len(self._work), n, *given, self._work)
+                advance_in_threads(*chunked)
         episodes[:] = self.draws[:, 1]
 
     def begin(self, mask: Array, keys: Array, episodes: Array, arguments: Any) -> None:
