@@ -205,6 +205,8 @@ def solver_summary(driven: Rollout) -> dict[str, Any]:
     The first call, which may still compile or allocate, counts like every other.
     """
     calls = driven.trace.solve_time[1:]
+    # Zero where the agent was still busy.
+    calls = calls[calls > 0.0]
     return {
         "median": float(np.median(calls)),
         "p99": float(np.percentile(calls, 99)),

@@ -12,6 +12,7 @@ from rich.table import Table
 from experiments.benchmark import run_benchmark, selected
 from experiments.figures import COLOURS
 from experiments.results import revision, versions
+from experiments.suites import grid
 from experiments.tables import Estimate, estimate
 from lpv_track_env.conditions import REALTIME
 from trajectories.atomic import write_atomically
@@ -64,21 +65,14 @@ def specs_of(
     trajectories: Sequence[str], seeds: Sequence[int], agent: str
 ) -> dict[tuple[str, bool], list[Spec]]:
     """Cases by row and by whether delays are compensated."""
-    return {
-        (label, compensated): [
-            {
-                "agent": agent,
-                "trajectory": trajectory,
-                "conditions": conditions,
-                "seed": seed,
-                "agent_settings": {"delay_compensation": compensated},
-            }
-            for trajectory in trajectories
-            for seed in seeds
-        ]
-        for label, conditions in variants().items()
-        for compensated in (True, False)
-    }
+    cells = {}
+    for label, conditions in variants().items():
+        for compensated in (True, False):
+            settings = {"delay_compensation": compensated}
+            cells[label, compensated] = grid(
+                (agent,), trajectories, seeds=seeds, conditions=conditions, agent_settings=settings
+            )
+    return cells
 
 
 def ablate(

@@ -25,6 +25,7 @@ from experiments.computing import ARRANGEMENTS, ComputingTimes, quantiles
 from experiments.figures import COLOURS
 from experiments.results import revision, versions
 from experiments.rollout import rollout
+from experiments.suites import grid
 from experiments.tables import estimate
 from lpv_track_env.estimator import Estimator
 from lpv_track_env.vehicle import VEHICLES
@@ -104,19 +105,10 @@ def specs_of(
             computing = {"arrangement": arrangement, **times, "mailbox": MAILBOX}
             probe = ComputingTimes(**computing, period=PERIOD)
             mean = float(np.mean([probe(k, 0.0)[0] for k in range(2000)]))
-            cells[label, arrangement] = [
-                {
-                    "agent": AGENT,
-                    "trajectory": trajectory,
-                    "conditions": {"name": "realtime", "computing_delay": mean},
-                    "control_period": PERIOD,
-                    "env_settings": ENV,
-                    "computing": computing,
-                    "seed": seed,
-                }
-                for trajectory in trajectories
-                for seed in seeds
-            ]
+            cells[label, arrangement] = grid(
+                (AGENT,), trajectories, seeds=seeds, control_period=PERIOD, env_settings=ENV,
+                conditions={"name": "realtime", "computing_delay": mean}, computing=computing,
+            )  # fmt: skip
     return cells
 
 
