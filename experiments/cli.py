@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.bags.arguments import add_bag_parsers
 from experiments.engines import one_thread
 
 EXIT_USAGE = 2
@@ -145,10 +146,18 @@ def parser() -> argparse.ArgumentParser:
     verify.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores"
     )
+
+    add_bag_parsers(
+        add(
+            "bag",
+            "Exchange drives with ROS: export, info, reference, replay.",
+            "lpv-track bag export --trajectory T2 --out run.bag",
+        )
+    )
     return root
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:  # noqa: PLR0911  one for each command
     """Run a parsed command; heavy modules load here, after one_thread."""
     from rich.console import Console
 
@@ -208,6 +217,10 @@ def run(options: argparse.Namespace) -> int:
             solver=options.solver or SOLVER,
             console=console,
         )
+    if options.command == "bag":
+        from experiments.bags.command import run_bag
+
+        return run_bag(options, console)
     return _trajectories(options, console)
 
 
