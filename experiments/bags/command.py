@@ -4,10 +4,11 @@ import argparse
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from experiments.bags.messages import require_rosbags
-from experiments.bags.read import BagInfo, info, read
+from experiments.bags.read import BagInfo, info, printable, read
 from experiments.bags.reference import reference
 from experiments.bags.runs import DATUM, check_datum, topics_of
 from experiments.bags.topics import KINDS, SECOND, Topic
@@ -94,8 +95,8 @@ def _info(file: Path, console: Console) -> int:
         kind = kinds.get(topic.name)
         rate, remarks = _remarks(bag, topic.name, kind) if kind is not None else ("", "")
         table.add_row(
-            topic.name, topic.message_type, str(topic.messages), rate,
-            "" if kind is None else kind.KIND, remarks,
+            escape(printable(topic.name)), escape(printable(topic.message_type)), str(topic.messages), rate,
+            "" if kind is None else kind.KIND, escape(remarks),
         )  # fmt: skip
     seconds = (bag.end - bag.start) / SECOND
     _say(console, f"{file}: ROS {bag.ros}, {bag.storage}, {seconds:.1f} s")

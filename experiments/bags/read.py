@@ -34,7 +34,18 @@ SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
 
 
 class BagError(ValueError):
-    """A bag that is no use for what is asked, said in one line."""
+    """A bag that is no use for what is asked, said in one line.
+
+    What a message quotes of a file may be anything; what does not print becomes a space.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(printable(message).split()))
+
+
+def printable(text: str) -> str:
+    """Text without line ends and what steers a terminal."""
+    return "".join(character if character.isprintable() else " " for character in text)
 
 
 @dataclass(frozen=True)
