@@ -176,7 +176,9 @@ def test_headings_come_back_unwrapped(tmp_path: Path, bag_format: str) -> None:
 
 
 def logged(
-    file: Path, stamps: list[int], change: Callable[[int, Any], None] = lambda _k, _m: None,
+    file: Path,
+    stamps: list[int],
+    change: Callable[[int, Any], None] = lambda _k, _m: None,
     topics: tuple[str, ...] = ("/odom",),
 ) -> Path:
     """Odometry with any stamps in the order given, x their place, logged one a second."""
@@ -190,8 +192,8 @@ def logged(
                 sec, nanosec = divmod(stamps[k], SECOND)
                 message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
                 change(k, message)
-                data = store.serialize_ros1(message, "nav_msgs/msg/Odometry")
-                writer.write(connection, received, data)
+                changed = store.serialize_ros1(message, "nav_msgs/msg/Odometry")
+                writer.write(connection, received, changed)
     return file
 
 
@@ -349,7 +351,7 @@ def test_foreign_files(tmp_path: Path) -> None:
         with pytest.raises(BagError, match=name):
             info(tmp_path / name)
     (tmp_path / "folder").mkdir()
-    with pytest.raises(BagError, match="there is no metadata.yaml in the folder"):
+    with pytest.raises(BagError, match=r"there is no metadata\.yaml in the folder"):
         info(tmp_path / "folder")
     (tmp_path / "folder" / "metadata.yaml").write_text("rosbag2_bagfile_information: [1, {\n")
     with pytest.raises(BagError, match="folder: cannot be read as a ROS 2 bag"):
@@ -361,8 +363,8 @@ def test_damaged_bags_fail_in_one_line(bag: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     source = bag if bag.is_file() else next(f for f in bag.iterdir() if f.suffix != ".yaml")
     whole = source.read_bytes()
-    refused = 0
-    for trial in range(40):
+    messages: list[str] = []
+    for trial in range(24):
         content = bytearray(whole)
         if trial % 2:
             content = content[: int(rng.integers(1, len(content)))]
@@ -382,10 +384,9 @@ def test_damaged_bags_fail_in_one_line(bag: Path, tmp_path: Path) -> None:
             info(copy)
             read(copy, Odometry)
         except BagError as error:
-            refused += 1
-            assert str(copy) in str(error)
-            assert "\n" not in str(error)
-    assert refused >= 15
+            messages.append(str(error))
+    assert len(messages) >= 8
+    assert [text for text in messages if str(tmp_path) not in text or not text.isprintable()] == []
 
 
 def test_ros_2_types_are_those_of_every_distribution() -> None:

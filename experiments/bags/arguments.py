@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-TOPIC_KINDS = ("odometry", "imu", "wheel-speed", "fix", "command", "datum")
+TOPIC_KINDS = ("odometry", "imu", "wheel-speed", "fix", "command")
+"""Kinds of topics of which a bag may have several: each has an option --KIND-topic."""
 
 
 def add_bag_parsers(bag: argparse.ArgumentParser) -> None:
@@ -38,6 +39,13 @@ def add_bag_parsers(bag: argparse.ArgumentParser) -> None:
             "lpv-track bag reference run.bag --out path.csv",
         )
     )
+    _replay(
+        add(
+            "replay",
+            "Feed a drive's sensors to the estimator and an agent, and compare with the recording.",
+            "lpv-track bag replay run.bag --trajectory T2 --out results/replay",
+        )
+    )
 
 
 def _export(export: argparse.ArgumentParser) -> None:
@@ -46,6 +54,12 @@ def _export(export: argparse.ArgumentParser) -> None:
     export.add_argument("--vehicle", default="m2-minibus", metavar="NAME")
     export.add_argument("--speed-mode", default="variable", choices=["variable", "fixed"])
     export.add_argument("--seed", type=int, default=0)
+    export.add_argument("--conditions", default="simulation", metavar="NAME", help="of the drive")
+    export.add_argument(
+        "--sensors", metavar="NAME",
+        help="conditions, e.g. realtime, whose errors /imu, /wheel_speed and /fix have (default: "
+        "none, the truth); drawn by --seed",
+    )  # fmt: skip
     export.add_argument("--agent-set", nargs="+", default=[], metavar="KEY=VALUE")
     export.add_argument("--env", nargs="+", default=[], metavar="KEY=VALUE")
     export.add_argument(
@@ -76,6 +90,23 @@ def _reference(made: argparse.ArgumentParser) -> None:
         help="planned: 10 m/s, 2 m/s^2 laterally, 1.5 m/s^2 along the path, jerk-limited",
     )  # fmt: skip
     _add_datum(made, "of fixes: where x = y = 0 lies (default: the bag's datum, or the first fix)")
+
+
+def _replay(replay: argparse.ArgumentParser) -> None:
+    replay.add_argument("file", type=Path, metavar="FILE")
+    replay.add_argument(
+        "--trajectory", required=True, metavar="NAME", help="a name, or a file of `bag reference`"
+    )
+    replay.add_argument("--agent", default="lpv-nmpc", metavar="NAME")
+    replay.add_argument("--vehicle", default="m2-minibus", metavar="NAME")
+    replay.add_argument("--agent-set", nargs="+", default=[], metavar="KEY=VALUE")
+    replay.add_argument("--control-period", type=float, default=0.05, metavar="S")
+    replay.add_argument("--out", type=Path, default=Path("results/replay"), metavar="DIR")
+    for kind in TOPIC_KINDS:
+        replay.add_argument(f"--{kind}-topic", metavar="TOPIC", help="where there are several")
+    _add_datum(
+        replay, "where the path's x = y = 0 lies (default: the path's, the bag's, or the first fix)"
+    )
 
 
 def _add_datum(parser: argparse.ArgumentParser, meaning: str) -> None:

@@ -1,4 +1,4 @@
-"""`lpv-track bag`: export, info, reference."""
+"""`lpv-track bag`: export, info, reference, replay."""
 
 import argparse
 from pathlib import Path
@@ -11,8 +11,10 @@ from experiments.bags.messages import require_rosbags
 from experiments.bags.read import BagInfo, info, printable, read
 from experiments.bags.reference import reference
 from experiments.bags.runs import DATUM, check_datum, topics_of
+from experiments.bags.sensors import measured
 from experiments.bags.topics import KINDS, SECOND, Topic
 from experiments.bags.write import refuse_existing, ros_version, write
+from lpv_track_env.conditions import load as load_conditions
 
 Datum = tuple[float, float, float]
 
@@ -32,7 +34,9 @@ def run_bag(options: argparse.Namespace, console: Console) -> int:
         return _export(options, console)
     if options.action == "info":
         return _info(options.file, console)
-    return _reference(options, console)
+    if options.action == "reference":
+        return _reference(options, console)
+    return _replay(options, console)
 
 
 def _say(console: Console, text: str) -> None:
@@ -55,12 +59,14 @@ def _export(options: argparse.Namespace, console: Console) -> int:
 
     # All that can be refused is refused before the drive.
     datum = _datum(options) or DATUM
+    sensors = None if options.sensors is None else load_conditions(options.sensors)
     ros_version(options.out, options.format)
     refuse_existing(options.out)
     case = Case(
         agent=options.agent,
         trajectory=options.trajectory,
         vehicle=options.vehicle,
+        conditions=options.conditions,
         speed_mode=options.speed_mode,
         seed=options.seed,
         agent_settings=parse_settings(options.agent_set),
@@ -77,6 +83,8 @@ def _export(options: argparse.Namespace, console: Console) -> int:
         )
     car = env.unwrapped.vehicle  # type: ignore[attr-defined]
     topics = topics_of(done.trace, car, datum=datum)
+    if sensors is not None:
+        topics = measured(topics, sensors, options.seed)
     write(options.out, topics, bag_format=options.format, storage=options.storage)
     messages = sum(map(len, topics.values()))
     _say(
@@ -95,8 +103,8 @@ def _info(file: Path, console: Console) -> int:
         kind = kinds.get(topic.name)
         rate, remarks = _remarks(bag, topic.name, kind) if kind is not None else ("", "")
         table.add_row(
-            escape(printable(topic.name)), escape(printable(topic.message_type)), str(topic.messages), rate,
-            "" if kind is None else kind.KIND, escape(remarks),
+            *(escape(printable(text)) for text in (topic.name, topic.message_type)),
+            str(topic.messages), rate, "" if kind is None else kind.KIND, escape(remarks),
         )  # fmt: skip
     seconds = (bag.end - bag.start) / SECOND
     _say(console, f"{file}: ROS {bag.ros}, {bag.storage}, {seconds:.1f} s")
@@ -147,4 +155,58 @@ def _reference(options: argparse.Namespace, console: Console) -> int:
         f"{line.deviation_rms:.3f} m rms from the smoothed line (largest "
         f"{line.deviation_max:.3f} m): {options.out}",
     )
+    return 0
+
+
+def _replay(options: argparse.Namespace, console: Console) -> int:
+    import json
+
+    import gymnasium
+
+    import agents
+    import trajectories
+    from agents.registry import check_settings
+    from experiments.bags.arguments import TOPIC_KINDS
+    from experiments.bags.comparison import draw, summary, table
+    from experiments.bags.replay import record, replay
+    from experiments.benchmark import parse_settings
+    from lpv_track_env import vehicle
+    from lpv_track_env.observer import PathObserver
+    from trajectories.atomic import write_atomically
+
+    path = trajectories.load(options.trajectory)
+    car = vehicle.load(options.vehicle)
+    settings = parse_settings(options.agent_set)
+    check_settings(options.agent, settings)
+    named = {
+        kind: topic
+        for kind in TOPIC_KINDS
+        if (topic := getattr(options, f"{kind.replace('-', '_')}_topic")) is not None
+    }
+    origin = path.metadata.get("origin")
+    datum = _datum(options)
+    if datum is None and origin is not None:
+        datum = (origin["latitude_deg"], origin["longitude_deg"], origin["height_m"])
+    recording = record(options.file, topics=named, datum=datum)
+    env = gymnasium.make(
+        "lpv_track_env/PathTracking-v0",
+        trajectory=path,
+        vehicle=car,
+        control_period=options.control_period,
+    )
+    agent = agents.make(options.agent, env, **settings)
+    observer = PathObserver(path, env.unwrapped.layout)  # type: ignore[attr-defined]
+    done = replay(recording, path, car, agent, observer, control_period=options.control_period)
+    found = {
+        "format": "lpv-track-replay/1", "bag": str(options.file), "trajectory": path.name,
+        "agent": options.agent, "vehicle": car.name, "control_period": options.control_period,
+        **summary(done),
+    }  # fmt: skip
+    file = options.out / "replay.json"
+    write_atomically(file, json.dumps(found, indent=1, allow_nan=False).encode())
+    draw(done, options.out / "replay.png")
+    console.print(table(found))
+    for remark in recording.remarks:
+        _say(console, f"remark: {remark}")
+    _say(console, f"written: {file}, {options.out / 'replay.png'}")
     return 0
