@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-from recorded_drives import CAR, driven
+from recorded_drives import driven
 from scipy.integrate import cumulative_trapezoid
 
 import trajectories
@@ -66,7 +66,7 @@ def driven_curvature(trace: Trace) -> Array:
 @pytest.fixture(scope="module")
 def run_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     bag = tmp_path_factory.mktemp("reference") / "run.bag"
-    write(bag, topics_of(driven(), CAR))
+    write(bag, topics_of(driven()))
     return bag
 
 
@@ -167,7 +167,7 @@ def test_a_tolerance_can_be_given(run_bag: Path) -> None:
 
 def test_a_gap_is_told(tmp_path: Path) -> None:
     trace = driven()
-    odom: Any = topics_of(trace, CAR)["/odom"]
+    odom: Any = topics_of(trace)["/odom"]
     kept = np.r_[0:100, 160 : len(odom)]
     columns = {name: getattr(odom, name)[kept] for name in odom.columns()}
     write(tmp_path / "a.bag", {"/odom": replace(odom, stamp=odom.stamp[kept], **columns)})

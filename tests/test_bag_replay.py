@@ -39,7 +39,7 @@ def replayed(bag: Path, trajectory: str = "u-turn", **settings: Any) -> Replay:
 
 
 def truth() -> dict[str, Topic]:
-    return topics_of(driven(), CAR)
+    return topics_of(driven())
 
 
 def test_perfect_sensors_show_the_truth_again(tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_sensors_err_as_their_conditions_say(tmp_path: Path) -> None:
         gnss_noise=0.05, gnss_wander=0.1, gnss_wander_time=2.0, heading_noise=0.01,
         heading_bias=0.02, yaw_rate_noise=0.003, speed_noise=0.05, speed_scale=0.01,
     )  # fmt: skip
-    perfect = topics_of(driven("T2"), CAR)
+    perfect = topics_of(driven("T2"))
     read_topics: Any = measured(perfect, sensors, seed=0)
     true: Any = perfect
     error = read_topics["/imu"].heading - true["/imu"].heading
@@ -101,7 +101,7 @@ def test_sensors_err_as_their_conditions_say(tmp_path: Path) -> None:
 
 def test_fixes_drop_out() -> None:
     sensors = Conditions(gnss_dropout_rate=0.2, gnss_dropout_duration=1.0)
-    found: Any = measured(topics_of(driven("T2"), CAR), sensors, seed=0)
+    found: Any = measured(topics_of(driven("T2")), sensors, seed=0)
     gaps = np.diff(found["/fix"].time)
     assert gaps.max() > 1.0
     assert (gaps > 0.15).sum() >= 5

@@ -81,8 +81,7 @@ def _export(options: argparse.Namespace, console: Console) -> int:
             seed=case.seed,
             on_step=lambda _step, _info: interrupts.check(),
         )
-    car = env.unwrapped.vehicle  # type: ignore[attr-defined]
-    topics = topics_of(done.trace, car, datum=datum)
+    topics = topics_of(done.trace, datum=datum)
     if sensors is not None:
         topics = measured(topics, sensors, options.seed)
     write(options.out, topics, bag_format=options.format, storage=options.storage)

@@ -14,8 +14,6 @@ from experiments.bags.topics import (
     WheelSpeed,
 )
 from experiments.rollout import Trace
-from lpv_track_env import bicycle
-from lpv_track_env.vehicle import VehicleParameters
 from trajectories.geodesy import geodetic
 
 Array = NDArray[np.float64]
@@ -31,7 +29,6 @@ STANDARD_GRAVITY = 9.80665
 
 def topics_of(
     trace: Trace,
-    vehicle: VehicleParameters,
     *,
     datum: tuple[float, float, float] = DATUM,
     start: int = START,
@@ -42,9 +39,8 @@ def topics_of(
     Parameters
     ----------
     trace
-        The run, n control periods.
-    vehicle
-        Its vehicle, whose vector field gives the acceleration that an IMU feels.
+        The run, n control periods. An IMU's acceleration is made of the differences of its
+        velocities: the mean over the periods before and after, whatever moved the vehicle.
     datum
         Latitude, longitude (deg) and height (m) of x = y = 0; x points east there, y north.
     start
@@ -68,8 +64,7 @@ def topics_of(
         raise ValueError(f"the fixes' period must be positive, not {fix_period} s")
     stamp = start + np.rint(trace.time * SECOND).astype(np.int64)
     vx, vy, heading, yaw_rate, x, y = trace.state.T
-    action = np.array([trace.acceleration, trace.steering_angle])
-    rate = bicycle.derivative(trace.state.T, action, vehicle)
+    forward, leftward = np.gradient(vx, trace.time), np.gradient(vy, trace.time)
     stride = max(round(fix_period / float(np.median(np.diff(trace.time)))), 1)
     level = np.column_stack([x, y, np.zeros_like(x)])[::stride]
     latitude, longitude, height = geodetic(level, datum)
@@ -78,8 +73,8 @@ def topics_of(
         Imu(
             stamp, heading, yaw_rate,
             # Velocity changes in a frame that turns: a = v' + r x v.
-            forward_acceleration=rate[bicycle.VX] - yaw_rate * vy,
-            leftward_acceleration=rate[bicycle.VY] + yaw_rate * vx,
+            forward_acceleration=forward - yaw_rate * vy,
+            leftward_acceleration=leftward + yaw_rate * vx,
             upward_acceleration=np.full_like(vx, STANDARD_GRAVITY),
         ),
         WheelSpeed(stamp, vx),
