@@ -104,6 +104,20 @@ def test_noise_of_5_cm_at_10_hz(tmp_path: Path) -> None:
     assert line.warnings == []
 
 
+def test_fixes_that_are_wrong_altogether_are_left_out(tmp_path: Path) -> None:
+    trace = driven()
+    x, y = trace.state[::2, 4].copy(), trace.state[::2, 5].copy()
+    wrong = np.array([20, 21, 90, 150, 200])
+    x[wrong] += 3.0
+    stamp = SECOND + np.arange(len(x)) * SECOND // 10
+    write(tmp_path / "a.bag", {"/fix": fixes(stamp, x, y, noise=0.02), "/datum": datum()})
+    line = reference(tmp_path / "a.bag")
+    assert line.path.metadata["outliers"] == len(wrong)
+    assert line.warnings == ["5 positions lie far off the others: left out"]
+    offset, _ = feet(line.path, trace.state[:, 4], trace.state[:, 5])
+    assert np.abs(offset).max() < 0.06
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_standstill_and_duplicates_fall_away(tmp_path: Path, noise: float) -> None:
     """Up to 5 m/s, a stop of 15 s half way round the bend, and on."""

@@ -35,6 +35,10 @@ SHAPE_TOLERANCE, SHAPE_SHARE = 3e-4, 0.05
 leaves ripples that bend a path of interpolating splines by up to 0.1 1/m (5 cm, 10 Hz)."""
 LEAST_SPEED = 0.5
 """m/s to which a recorded speed is raised: a reference never stands still."""
+OUTLIER, LEAST_OUTLIER = 6.0, 0.1
+OUTLIER_ROUNDS = 8
+"""Positions further off than so many deviations of the noise, and than so many m, are left out, and
+the rest is smoothed again, which may show more of them."""
 FEWEST_POSITIONS, SHORTEST = 8, 5.0
 LONGEST_GAP = 2.0
 """s without a position, beyond which there is a warning."""
@@ -152,9 +156,11 @@ def _line(
             f"no positions for {time[gap + 1] - time[gap]:.1f} s from {time[gap]:.1f} s on: bridged"
         )
     centre = means.mean(axis=0)  # coordinates of a map's grid would cost digits
-    splines = _smoothed(time, means - centre, smoothing)
-    apart = np.column_stack([spline(time) for spline in splines]) + centre - means
-    distance = np.hypot(*apart.T)
+    means -= centre
+    splines, kept = _robust(time, means, smoothing)
+    if not kept.all():
+        told.append(f"{int((~kept).sum())} positions lie far off the others: left out")
+    distance = _distances(splines, time[kept], means[kept])
     noise = float(np.sqrt(np.mean(distance**2)))
     at, chain = _resampled(splines, time)
     shape = smooth(chain + centre, max(SHAPE_TOLERANCE, SHAPE_SHARE * noise))
@@ -162,7 +168,7 @@ def _line(
     metadata.update(
         smoothing="cross-validated" if smoothing is None else smoothing,
         rms_deviation=noise, max_deviation=float(distance.max()),
-        positions=len(points), duplicates=reading.duplicates,
+        positions=len(points), outliers=int((~kept).sum()), duplicates=reading.duplicates,
         out_of_order=reading.out_of_order, unusable=reading.unusable, warnings=told,
     )  # fmt: skip
     try:
@@ -186,6 +192,30 @@ def _averaged(time: Array, points: Array) -> tuple[Array, Array]:
     sums = (np.bincount(group, weights=values) for values in (time, *points.T))
     when, x, y = (total / count for total in sums)
     return when, np.column_stack([x, y])
+
+
+def _robust(
+    time: Array, points: Array, tolerance: float | None
+) -> tuple[tuple[BSpline, BSpline], NDArray[np.bool_]]:
+    """Smoothing splines of points (m, 2) without those far off, and which were kept (m,)."""
+    kept = np.ones(len(time), dtype=np.bool_)
+    for _ in range(OUTLIER_ROUNDS):
+        splines = _smoothed(time[kept], points[kept], tolerance)
+        distance = _distances(splines, time, points)
+        # The median distance of white noise in the plane is 1.18 of its deviation in each axis.
+        noise = float(np.median(distance[kept])) / 1.1774
+        far = distance > max(OUTLIER * noise, LEAST_OUTLIER)
+        if (far == ~kept).all():
+            break
+        kept = ~far
+    return splines, kept
+
+
+def _distances(splines: tuple[BSpline, BSpline], time: Array, points: Array) -> Array:
+    """Distances (m,) of points (m, 2) from where splines are at their times."""
+    x, y = (spline(time) for spline in splines)
+    distances: Array = np.hypot(x - points[:, 0], y - points[:, 1])
+    return distances
 
 
 def _smoothed(time: Array, points: Array, tolerance: float | None) -> tuple[BSpline, BSpline]:
