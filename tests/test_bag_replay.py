@@ -19,7 +19,8 @@ import trajectories
 from experiments.bags.arguments import TOPIC_KINDS
 from experiments.bags.comparison import draw, summary
 from experiments.bags.read import BagError, info, read
-from experiments.bags.replay import Inputs, Replay, record, replay
+from experiments.bags.recording import record
+from experiments.bags.replay import Inputs, Replay, replay
 from experiments.bags.runs import topics_of
 from experiments.bags.sensors import measured
 from experiments.bags.topics import KINDS, SECOND, Commands, Odometry, Topic
@@ -171,6 +172,17 @@ def test_what_cannot_be_replayed(tmp_path: Path) -> None:
         write(bag, some)
         with pytest.raises(BagError, match=f"no topic with messages .*{kind}"):
             record(bag)
+
+
+def test_fixes_and_commands_of_other_times(tmp_path: Path) -> None:
+    topics = truth()
+    command: Any = topics["/command"]
+    topics["/command"] = replace(command, stamp=command.stamp - command.stamp[0] + 1)
+    fix: Any = topics["/fix"]
+    topics["/fix"] = replace(fix, stamp=fix.stamp + 100 * SECOND)
+    write(tmp_path / "a.bag", topics)
+    with pytest.raises(BagError, match="fixes and commands do not overlap in time"):
+        replayed(tmp_path / "a.bag")
 
 
 def test_options_for_topics_are_those_that_errors_name() -> None:

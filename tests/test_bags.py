@@ -355,9 +355,11 @@ def test_foreign_files(tmp_path: Path) -> None:
         info(tmp_path / "folder")
 
 
-def test_damaged_bags_fail_in_one_line(bag: Path, tmp_path: Path) -> None:
+@each_format
+def test_damaged_bags_fail_in_one_line(tmp_path: Path, bag_format: str) -> None:
     """Torn and flipped at random: an error of one line, or what could still be read."""
     rng = np.random.default_rng(0)
+    bag = written(tmp_path, bag_format, {"/odom": odometry(SECOND * np.arange(1, 61))})
     source = bag if bag.is_file() else next(f for f in bag.iterdir() if f.suffix != ".yaml")
     whole = source.read_bytes()
     messages: list[str] = []

@@ -167,7 +167,8 @@ def _replay(options: argparse.Namespace, console: Console) -> int:
     from agents.registry import check_settings
     from experiments.bags.arguments import TOPIC_KINDS
     from experiments.bags.comparison import draw, summary, table
-    from experiments.bags.replay import record, replay
+    from experiments.bags.recording import record
+    from experiments.bags.replay import replay
     from experiments.benchmark import parse_settings
     from lpv_track_env import vehicle
     from lpv_track_env.observer import PathObserver
