@@ -184,6 +184,12 @@ def _trajectories(options: argparse.Namespace, console: Any) -> int:
     return 0
 
 
+def _bag(options: argparse.Namespace, console: Any) -> int:
+    from experiments.bags.command import run_bag
+
+    return run_bag(options, console)
+
+
 RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "benchmark": _benchmark,
     "report": _report,
@@ -193,6 +199,7 @@ RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "ablation": _realtime,
     "latency": _realtime,
     "verify": _verify,
+    "bag": _bag,
 }
 """What runs each command."""
 

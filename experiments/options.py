@@ -5,6 +5,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+from experiments.bags.arguments import add_bag_parsers
+
 Add = Callable[[str, str, str], argparse.ArgumentParser]
 """Makes the parser of a command from its name, what it does, and an example."""
 
@@ -167,6 +169,16 @@ def _verify(add: Add) -> None:
     )
 
 
+def _bag(add: Add) -> None:
+    add_bag_parsers(
+        add(
+            "bag",
+            "Exchange drives with ROS: export, info, reference, replay.",
+            "lpv-track bag export --trajectory T2 --out run.bag",
+        )
+    )
+
+
 def parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     root = argparse.ArgumentParser(
@@ -195,6 +207,7 @@ def parser() -> argparse.ArgumentParser:
         _ablation,
         _latency,
         _verify,
+        _bag,
     ):
         declare(add)
     return root

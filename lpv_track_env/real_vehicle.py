@@ -28,7 +28,7 @@ STOP_DECELERATION = 2.0
 
 @compiled_internal
 def send(m: Array, queue: Array, now: Any, a: Any, delta: Any, offset: Any) -> None:
-    """Send a command computed from readings at `now`, its steering less an offset: it lands later."""
+    """Send a command made from readings at `now`, its steering less an offset: it lands later."""
     latency, occupied = m[real.LATENCY], m[real.OCCUPIED]
     if latency < 0.0:
         latency = m[real.COMPUTING_DELAY]
