@@ -11,9 +11,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lpv_track_env import episodes, kernels, vehicle
+from lpv_track_env import episodes, kernels, plants, vehicle
 from lpv_track_env.episodes import given_start, random_key
 from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.plants.episode import PlantEpisode
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.task import CONDITIONS, Task, action_space, checked_period, choose, reference
 from lpv_track_env.vector_infos import single_info
@@ -114,6 +115,11 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         Half width of the corridor, m.
     time_limit
         s; by default one and a half times the path's duration plus 10 s.
+    plant
+        What moves under the commands: "bicycle", or a vehicle that this project did not model
+        (`lpv_track_env.plants`): "single-track", "drift", "multi-body", for the vehicles
+        `ford-escort`, `bmw-320i`, `vw-vanagon`; or a function of `VehicleParameters` that makes a
+        `Plant`. All but the bicycle run at some ten to a hundred times its cost.
 
     ## Version history
 
@@ -143,6 +149,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         time_limit: float | None = None,
         initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
         random_start: bool = False,
+        plant: str | plants.Factory = plants.BICYCLE,
     ) -> None:
         if render_mode is not None:
             choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
@@ -151,6 +158,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._speed = (speed_mode, fixed_speed)
         car = _load_vehicle(vehicle)
         period = checked_period(control_period)
+        self.plant = plant
         self.base_task = Task(
             path=reference(trajectory, car, speed_mode, fixed_speed),
             vehicle=car,
@@ -174,7 +182,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._key, self._episode = np.uint64(0), -1
         self._renderer: Renderer | None = None
         self._open_views()
-        self._use(self.base_task)
+        self._use(self.base_task, self._plant_of(self.base_task))
 
     def _open_views(self) -> None:
         """Parts of the episode's array: to make a view costs as much as a copy."""
@@ -186,12 +194,18 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         # Python numbers pass through a memoryview in half the time.
         self._command: Any = data.data
 
-    def _use(self, task: Task) -> None:
+    def _use(self, task: Task, plant: PlantEpisode | None) -> None:
         if getattr(self, "task", None) is task:
             return
-        self.task = task
+        self.task, self._plant = task, plant
         self._constants[:] = task.constants()
         self._take_table(task.path.table)
+
+    def _plant_of(self, task: Task) -> PlantEpisode | None:
+        if getattr(self, "task", None) is task:
+            return self._plant
+        plant = plants.make(self.plant, task.vehicle)
+        return None if plant is None else PlantEpisode(plant)
 
     def _take_table(self, table: NDArray[np.float64]) -> None:
         self._table = table
@@ -200,7 +214,10 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _first_advance(self, *arguments: NDArray[np.float64]) -> Any:
         """Have `kernels.advance` compiled where it is needed, in a first step, and go there."""
-        self._advance = entry_point(kernels.advance, *arguments)
+        if self._plant is None:
+            self._advance = entry_point(kernels.advance, *arguments)
+        else:
+            self._advance = self._plant.advance
         return self._advance(*arguments)
 
     @property
@@ -237,14 +254,17 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             choose("reset option", key, RESET_OPTIONS)
         task = self.episode_task(options)
         given = given_start(options, task.path.length)
+        plant = self._plant_of(task)
         # All is checked: from here on the last episode is gone.
         super().reset(seed=seed)
         self._count_episode(reseeded=seed is not None)
-        self._use(task)
+        self._use(task, plant)
         episodes.begin(
             self._memory, self._constants, self._table, self._observation,
             self._key, self._episode, given,
         )  # fmt: skip
+        if plant is not None:
+            plant.begin(self._memory)
         self._running = True
         if self._renderer is not None:
             self._renderer.begin(task)
