@@ -20,12 +20,13 @@ import trajectories
 from agents.registry import check_settings, source_file
 from experiments import metrics
 from experiments.rollout import Rollout, rollout
-from lpv_track_env import vehicle
+from lpv_track_env import plants, vehicle
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.task import SPEED_MODES, choose
+from lpv_track_env.vehicle import VehicleParameters
 from trajectories.compilation import source_digest
 
-VEHICLE_FIELDS = tuple(field.name for field in fields(vehicle.VehicleParameters))
+VEHICLE_FIELDS = tuple(field.name for field in fields(VehicleParameters))
 ENV_SETTINGS = tuple(
     parameter.name
     for parameter in inspect.signature(PathTrackingEnv).parameters.values()
@@ -80,27 +81,28 @@ class Case:
             Listing the known names and the nearest.
         """
         check_settings(self.agent, self.agent_settings)
-        vehicle.load(self.vehicle)
         trajectories.load(self.trajectory)
         choose("speed mode", self.speed_mode, SPEED_MODES)
         for key in self.env_settings:
             choose("environment setting", key, ENV_SETTINGS)
         for key in self.vehicle_changes:
             choose("vehicle field", key, VEHICLE_FIELDS)
+        plants.make(self.env_settings.get("plant", plants.BICYCLE), self.make_vehicle())
+
+    def make_vehicle(self) -> VehicleParameters:
+        """The case's vehicle, with what is changed of it."""
+        changes = {
+            key: tuple(value) if isinstance(value, list) else value
+            for key, value in self.vehicle_changes.items()
+        }
+        return vehicle.load(self.vehicle).replace(**changes)
 
     def make_env(self, **settings: Any) -> gymnasium.Env[Any, Any]:
         """The case's environment; `settings` are added to the case's own."""
-        car = vehicle.load(self.vehicle)
-        if self.vehicle_changes:
-            changes = {
-                key: tuple(value) if isinstance(value, list) else value
-                for key, value in self.vehicle_changes.items()
-            }
-            car = car.replace(**changes)
         return gymnasium.make(
             "lpv_track_env/PathTracking-v0",
             trajectory=self.trajectory,
-            vehicle=car,
+            vehicle=self.make_vehicle(),
             speed_mode=self.speed_mode,
             fixed_speed=self.fixed_speed,
             conditions=self.conditions,

@@ -20,11 +20,20 @@ Acceleration
     wheels' own inertia (2.6 % of the BMW's mass in `drift`, 5.3 % in `multi-body`) come off it. All
     of them limit it to the engine's power, a_max v_switch / v.
 
-Below 0.1 m/s (drift: 0.2 m/s) the models pass to a kinematic one, abruptly but for the drift model.
+Speed
+    Forwards only: brakes hold at standstill (v_min is 0), for in reverse the single-track's tyres
+    push where they should damp, and the multi-body divides by zero. Below 0.1 m/s (drift: 0.2 m/s)
+    the models pass to a kinematic one, abruptly but for the drift model.
+Left and right
+    The Pacejka tyre's data are not symmetric: r_vy1, r_by3, r_hx1 push to one side. Camber shifts a
+    tyre's curve by p_hy1 and p_vy1 towards the side that it leans to, however little: in the
+    multi-body, whose wheels lean with its roll, lateral force jumps by a tenth of the load each way
+    as the roll goes through zero. There its integration converges at first order.
 """
 
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -55,7 +64,8 @@ try:
     from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
-        'this plant needs the package commonroad-vehicle-models: pip install "lpv-track-env[plants]"'
+        "this plant needs the package commonroad-vehicle-models: "
+        'pip install "lpv-track-env[plants]"'
     ) from error
 
 Array = NDArray[np.float64]
@@ -129,7 +139,7 @@ def drive_multi_body(x: Array, u: tuple[float, float], p: Any, h: float, steps: 
         combine(x, h, k1, k2, k3, k4)
 
 
-class CommonRoadPlant:
+class CommonRoadPlant(ABC):
     """What the three have in common.
 
     Parameters
@@ -144,6 +154,8 @@ class CommonRoadPlant:
         For any other vehicle.
     """
 
+    integrate: Callable[..., None]
+    """Take Runge-Kutta steps (x, inputs, parameters, h, steps) in place."""
     longest_step: float
     """s; what the model's motion, beside its fastest pole, asks for."""
 
@@ -155,10 +167,6 @@ class CommonRoadPlant:
     @abstractmethod
     def begin(self, state: Array, steering_angle: float) -> None:
         """Start an episode; see `Plant`."""
-
-    @abstractmethod
-    def drive(self, inputs: tuple[float, float], step: float, steps: int) -> None:
-        """Integrate `x` with [steering rate, acceleration] held."""
 
     @abstractmethod
     def body_velocity(self) -> tuple[float, float]:
@@ -174,7 +182,7 @@ class CommonRoadPlant:
         rolling = self.rolling_deceleration * vx * float(inverse_speed(vx))
         inputs = ((steering_angle - self.x[STEERING]) / period, acceleration - rolling)
         steps = self.steps(inputs[1], period)
-        self.drive(inputs, period / steps, steps)
+        self.integrate(self.x, inputs, self.parameters, period / steps, steps)
         return self.state()
 
     def steps(self, acceleration: float, period: float) -> int:
@@ -210,53 +218,53 @@ class _OneTrack(CommonRoadPlant):
         ]
 
     def body_velocity(self) -> tuple[float, float]:
+        """Velocity (vx, vy) of the centre of gravity in the body's frame, m/s."""
         speed, sideslip = float(self.x[SPEED]), float(self.x[SIDESLIP])
         return speed * math.cos(sideslip), speed * math.sin(sideslip)
 
     def tyre_pole(self, speed: float) -> float:
         """Sum of the lateral dynamics' damping rates, 1/s: no smaller than its fastest pole."""
         p = self.parameters
-        return -p.tire.p_ky1 * GRAVITY * (1.0 + p.m * p.a * p.b / p.I_z) / speed
+        return float(-p.tire.p_ky1 * GRAVITY * (1.0 + p.m * p.a * p.b / p.I_z) / speed)
 
 
 class SingleTrack(_OneTrack):
     """CommonRoad's single-track model (st), 7 states, tyres linear in slip and in load."""
 
+    integrate = staticmethod(drive_single_track)
     longest_step = 0.005
 
     def begin(self, state: Array, steering_angle: float) -> None:
         """Start an episode; see `Plant`."""
         self.x = np.array(self.core(state, steering_angle))
 
-    def drive(self, inputs: tuple[float, float], step: float, steps: int) -> None:
-        drive_single_track(self.x, inputs, self.parameters, step, steps)
-
     def fastest_pole(self, speed: float) -> float:
+        """Bound of the fastest pole, the tyres', 1/s."""
         return self.tyre_pole(speed)
 
 
 class Drift(_OneTrack):
     """CommonRoad's drift single-track model (std), 9 states: Pacejka tyres, one wheel an axle."""
 
+    integrate = staticmethod(drive_drift)
     longest_step = 0.002
 
     def begin(self, state: Array, steering_angle: float) -> None:
         """Start an episode, wheels rolling without slip; see `Plant`."""
         self.x = np.array(init_std(self.core(state, steering_angle), self.parameters))
 
-    def drive(self, inputs: tuple[float, float], step: float, steps: int) -> None:
-        drive_drift(self.x, inputs, self.parameters, step, steps)
-
     def fastest_pole(self, speed: float) -> float:
+        """Bound of the fastest pole, mostly that of a wheel's spin, 1/s."""
         p = self.parameters
         load = p.m * GRAVITY * max(p.a, p.b) / (p.a + p.b)
-        spin = p.R_w**2 * p.tire.p_kx1 * load / (p.I_y_w * speed)
+        spin = float(p.R_w**2 * p.tire.p_kx1 * load / (p.I_y_w * speed))
         return max(spin, self.tyre_pole(speed))
 
 
 class MultiBody(CommonRoadPlant):
     """CommonRoad's multi-body model (mb), 29 states: suspension, compliance, four tyres."""
 
+    integrate = staticmethod(drive_multi_body)
     longest_step = 0.001
 
     def begin(self, state: Array, steering_angle: float) -> None:
@@ -266,13 +274,12 @@ class MultiBody(CommonRoadPlant):
         core += [float(state[PSI]), float(state[YAW_RATE]), math.atan2(vy, vx)]
         self.x = np.array(init_mb(core, self.parameters), dtype=np.float64)
 
-    def drive(self, inputs: tuple[float, float], step: float, steps: int) -> None:
-        drive_multi_body(self.x, inputs, self.parameters, step, steps)
-
     def body_velocity(self) -> tuple[float, float]:
+        """Velocity (vx, vy) of the sprung mass in the body's frame, m/s."""
         return float(self.x[SPEED]), float(self.x[LATERAL_SPEED])
 
     def fastest_pole(self, speed: float) -> float:
+        """Bound of the fastest pole: a wheel's spin, or the roll of an axle on its tyres, 1/s."""
         p = self.parameters
         load = p.m * GRAVITY * max(p.a, p.b) / (p.a + p.b)
         spin = p.R_w**2 * p.tire.p_kx1 * 0.5 * load / (p.I_y_w * speed)
@@ -305,6 +312,7 @@ def parameters_of(vehicle: VehicleParameters) -> Any:
     given = setup_vehicle_parameters(VEHICLE_IDS[vehicle.name])
     given.steering.max, given.steering.v_max = vehicle.max_steering_angle, vehicle.max_steering_rate
     given.steering.min, given.steering.v_min = -given.steering.max, -given.steering.v_max
+    given.longitudinal.v_min = 0.0
     layout, values = _as_record(given)
     return np.array([values], dtype=layout)[0]
 

@@ -37,7 +37,8 @@ class PlantEpisode:
                 state = self.plant.advance(a, delta, period)
             except (ArithmeticError, ValueError):
                 state = np.full(6, np.nan)
-            end = kernels.conclude(episode, table, *state.tolist(), a, delta, bits)
+            vx, vy, psi, r, x, y = state.tolist()
+            end = kernels.conclude(episode, table, vx, vy, psi, r, x, y, a, delta, bits)
         told = episode[kernels.MEMORY : kernels.CONSTANTS].tolist()[kernels.ARC_LENGTH :]
         clipped = kernels.CLIPPED - kernels.ARC_LENGTH
         return end, *told[:clipped], int(told[clipped]), *told[clipped + 1 :]

@@ -20,7 +20,12 @@ def recompiled(function: Callable[..., Any]) -> Callable[..., Any]:
         A plain function of numbers, arrays and lists of floats, as are those that it calls, by
         their names or as attributes of modules.
     """
-    return _Recompiler(function.__module__.partition(".")[0]).function(function)
+    compiled: Callable[..., Any] = _Recompiler(_package(function.__module__)).function(function)
+    return compiled
+
+
+def _package(module: str) -> str:
+    return module.partition(".")[0]
 
 
 class _Recompiler:
@@ -49,8 +54,8 @@ class _Recompiler:
         bound = dict(names)
         for name in used:
             value = names.get(name)
-            if inspect.isfunction(value) and value.__module__.partition(".")[0] == self.package:
+            if inspect.isfunction(value) and _package(value.__module__) == self.package:
                 bound[name] = self.function(value)
-            elif inspect.ismodule(value) and value.__name__.partition(".")[0] == self.package:
+            elif inspect.ismodule(value) and _package(value.__name__) == self.package:
                 bound[name] = self.module(value)
         return bound
