@@ -38,7 +38,9 @@ def parser() -> argparse.ArgumentParser:
         "lpv-track benchmark --agents stanley lqr --trajectories T1 T2 --out results/mine",
     )
     benchmark.add_argument(
-        "--suite", default="paper", help="paper (default), quick, converged, sideslip or frozen"
+        "--suite",
+        default="paper",
+        help="paper (default), quick, converged, sideslip, frozen or plants",
     )
     benchmark.add_argument(
         "--agents", nargs="+", metavar="NAME", help="default: all; your own: file.py:Class"

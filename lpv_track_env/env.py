@@ -119,7 +119,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         What moves under the commands: "bicycle", or a vehicle that this project did not model
         (`lpv_track_env.plants`): "single-track", "drift", "multi-body", for the vehicles
         `ford-escort`, `bmw-320i`, `vw-vanagon`; or a function of `VehicleParameters` that makes a
-        `Plant`. All but the bicycle run at some ten to a hundred times its cost.
+        `Plant`. A step with these costs 20 to 200 times as much, more below 2 m/s.
 
     ## Version history
 

@@ -395,7 +395,7 @@ def steps(env: Any, commands: Array) -> list[bytes]:
     return [pickle.dumps((*env.step(action)[:2], env.state)) for action in commands]
 
 
-@each_plant
+@pytest.mark.parametrize("name", plants.PLANTS)
 def test_replay_is_bitwise(name: str) -> None:
     env = environment(plant=name, random_start=True, time_limit=5.0).unwrapped
     env.reset(seed=3)

@@ -19,16 +19,15 @@ Acceleration
     the other two it is a torque m R_w a on the wheels, so that slip, the front tyres' drag and the
     wheels' own inertia (2.6 % of the BMW's mass in `drift`, 5.3 % in `multi-body`) come off it. All
     of them limit it to the engine's power, a_max v_switch / v.
-
 Speed
     Forwards only: brakes hold at standstill (v_min is 0), for in reverse the single-track's tyres
     push where they should damp, and the multi-body divides by zero. Below 0.1 m/s (drift: 0.2 m/s)
     the models pass to a kinematic one, abruptly but for the drift model.
 Left and right
     The Pacejka tyre's data are not symmetric: r_vy1, r_by3, r_hx1 push to one side. Camber shifts a
-    tyre's curve by p_hy1 and p_vy1 towards the side that it leans to, however little: in the
-    multi-body, whose wheels lean with its roll, lateral force jumps by a tenth of the load each way
-    as the roll goes through zero. There its integration converges at first order.
+    tyre's curve by p_hy1 and p_vy1 with its sign, however small it is: in the multi-body, whose
+    wheels lean with its roll, side forces jump by 2 % of the load each way as a wheel's camber goes
+    through zero. There integration converges at first order only.
 """
 
 import math
