@@ -16,8 +16,8 @@ import pytest
 from numpy.typing import NDArray
 
 import agents
+from experiments.cases import run_case
 from experiments.cli import main
-from experiments.results import ResultStore
 from lpv_track_env import plants
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, derivative
 from lpv_track_env.env import PathTrackingEnv
@@ -508,12 +508,12 @@ def test_the_vector_environment_drives_the_bicycle_only() -> None:
     assert envs.step(np.zeros((2, 2), dtype=np.float32))[0].shape[0] == 2
 
 
-def test_benchmark_takes_a_plant(tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_case_takes_a_plant(capsys: pytest.CaptureFixture[str]) -> None:
+    spec = {"agent": "stanley", "trajectory": "u-turn", "vehicle": "bmw-320i"}
+    case = run_case({**spec, "env_settings": {"plant": "single-track"}})
+    assert (case["status"], case["end"]) == ("ok", "finished")
     command = ["benchmark", "--agents", "stanley", "--trajectories", "u-turn"]
-    command += ["--vehicles", "bmw-320i", "--workers", "1", "--out", str(tmp_path / "results")]
-    assert main([*command, "--env", "plant=single-track"]) == 0
-    (case,) = ResultStore(tmp_path / "results").cases()
-    assert (case["end"], case["env_settings"]) == ("finished", {"plant": "single-track"})
-    assert "plant=single-track" in capsys.readouterr().out
-    assert main([*command, "--resume", "--env", "plant=drfit"]) == 2
+    assert main([*command, "--vehicles", "bmw-320i", "--env", "plant=drfit"]) == 2
     assert "nearest: drift" in capsys.readouterr().err
+    assert main([*command, "--env", "plant=drift"]) == 2
+    assert "no parameters for vehicle 'm2-minibus'" in capsys.readouterr().err
