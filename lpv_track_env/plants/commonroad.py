@@ -37,6 +37,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -312,6 +313,9 @@ def parameters_of(vehicle: VehicleParameters) -> Any:
     given.steering.max, given.steering.v_max = vehicle.max_steering_angle, vehicle.max_steering_rate
     given.steering.min, given.steering.v_min = -given.steering.max, -given.steering.v_max
     given.longitudinal.v_min = 0.0
+    if numba.config.DISABLE_JIT:
+        # To plain Python `min` and `max` of a record are its methods.
+        return given
     layout, values = _as_record(given)
     return np.array([values], dtype=layout)[0]
 
