@@ -313,7 +313,7 @@ def parameters_of(vehicle: VehicleParameters) -> Any:
     given.steering.max, given.steering.v_max = vehicle.max_steering_angle, vehicle.max_steering_rate
     given.steering.min, given.steering.v_min = -given.steering.max, -given.steering.v_max
     given.longitudinal.v_min = 0.0
-    if numba.config.DISABLE_JIT:
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         # To plain Python `min` and `max` of a record are its methods.
         return given
     layout, values = _as_record(given)
