@@ -106,6 +106,9 @@ class Conditions:
     Friction is a parabola of the slip that ends in sliding (brush model; Pacejka, Tire and Vehicle
     Dynamics, section 3.2), given to the bicycle as the secant stiffness at the current slip.
 
+    With another plant than the bicycle (`lpv_track_env.plants`) mass, inertia, stiffness, rolling
+    resistance, friction and wind are that plant's own: those fields do nothing.
+
     A computation that takes longer than a control period makes the controller miss the next: its
     action there is dropped, the command in force is held, and `deadline_misses` counts it.
 

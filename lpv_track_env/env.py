@@ -221,11 +221,6 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if getattr(self, "task", None) is task:
             return self._plant
         plant = plants.make(self.plant, task.vehicle)
-        if plant is not None and task.conditions is not None:
-            raise ValueError(
-                "plants other than 'bicycle' drive under conditions 'simulation' only, not "
-                f"{task.conditions.name!r}"
-            )
         return None if plant is None else PlantEpisode(plant)
 
     def _take_table(self, table: NDArray[np.float64]) -> None:
@@ -335,14 +330,14 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
                 self._memory, self._constants, self._table, self._observation,
                 self._key, self._episode, given,
             )  # fmt: skip
-            if plant is not None:
-                plant.begin(self._memory)
         else:
             self._draws[:] = self._key, self._episode
             real_env.begin_real(
                 self._real.memory, self._memory, self._real.spec, self._constants, self._table,
                 self._observation, self._draws, given,
             )  # fmt: skip
+        if plant is not None:
+            plant.begin(self._memory)
         self._running = True
         if self._renderer is not None:
             self._renderer.begin(task)

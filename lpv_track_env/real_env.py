@@ -20,7 +20,15 @@ from lpv_track_env.real_sensors import (
     read_sensors,
     receive_satellites,
 )
-from lpv_track_env.real_vehicle import INSTANT, blow, command_age, move, send
+from lpv_track_env.real_vehicle import (
+    INSTANT,
+    blow,
+    command_age,
+    move,
+    send,
+    serve,
+    stop_acceleration,
+)
 from trajectories.compilation import compiled, compiled_internal
 from trajectories.projection import SEARCH_WINDOW
 
@@ -32,17 +40,12 @@ PERIOD_DRAW, DRAWS = 128, 64
 
 
 @compiled_internal
-def drive_real(
-    m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array, table: Array,
-    observation: Array, key: Any, episode: Any, work: Array,
-) -> int:  # fmt: skip
-    """One control period of an episode under conditions, in place; the code of its end."""
-    p = constants
-    fixes = real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM])
-    filtered = fixes + real.WAY * int(spec[real.FIX_ROOM])
-    queue, ways, filter_memory = m[real.TAIL : fixes], m[fixes:filtered], m[filtered:]
+def take_command(m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array) -> int:
+    """Begin a control period: send its command, if it can be; the bits of what was clipped."""
+    p, fixes = constants, real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM])
+    queue = m[real.TAIL : fixes]
+    filter_memory = m[fixes + real.WAY * int(spec[real.FIX_ROOM]) :]
     now = memory[k.STEPS] * p[k.PERIOD]
-    draw = PERIOD_DRAW + DRAWS * (int(memory[k.STEPS]) + 1)
     bits = 0
     if m[real.FREE_AT] > now + INSTANT:
         # The controller is still busy with an earlier command: it misses its turn.
@@ -65,8 +68,19 @@ def drive_real(
     )
     stale = command_age(m, queue, now) > spec[real.MAX_COMMAND_AGE] + INSTANT
     m[real.STOPPING] = 1.0 if blind or stale else 0.0
-    blow(m, key, episode, draw, p[k.PERIOD])
-    vx, vy, psi, r, x, y = move(m, queue, memory, p, now)
+    return bits
+
+
+@compiled_internal
+def end_period(
+    m: Array, memory: Array, vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, bits: int,
+    spec: Array, constants: Array, table: Array, observation: Array, key: Any, episode: Any,
+    work: Array,
+) -> int:  # fmt: skip
+    """End a control period with a new state: errors, end, reward, sensors, estimate."""
+    p, fixes = constants, real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM])
+    filtered = fixes + real.WAY * int(spec[real.FIX_ROOM])
+    ways, filter_memory = m[fixes:filtered], m[filtered:]
     end = k.finish(
         memory, p, table, observation, vx, vy, psi, r, x, y, m[real.SERVO_A],
         m[real.SERVO_DELTA], bits,
@@ -75,11 +89,29 @@ def drive_real(
         # What was seen last stays: there is no state that sensors could read.
         return end
     now = memory[k.STEPS] * p[k.PERIOD]
+    draw = PERIOD_DRAW + DRAWS * int(memory[k.STEPS])
     read_sensors(m, memory, key, episode, draw, p[k.PERIOD])
     receive_satellites(m, ways, memory, now, key, episode, draw, spec)
     estimate(m, ways, filter_memory, memory, now, spec, work)
     see(m, p, table, observation, vx * p[k.PERIOD])
     return end
+
+
+@compiled_internal
+def drive_real(
+    m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array, table: Array,
+    observation: Array, key: Any, episode: Any, work: Array,
+) -> int:  # fmt: skip
+    """One control period of an episode under conditions, in place; the code of its end."""
+    bits = take_command(m, memory, a, delta, spec, constants)
+    period = constants[k.PERIOD]
+    blow(m, key, episode, PERIOD_DRAW + DRAWS * (int(memory[k.STEPS]) + 1), period)
+    queue = m[real.TAIL : real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM])]
+    vx, vy, psi, r, x, y = move(m, queue, memory, constants, memory[k.STEPS] * period)
+    return end_period(
+        m, memory, vx, vy, psi, r, x, y, bits, spec, constants, table, observation, key, episode,
+        work,
+    )  # fmt: skip
 
 
 @compiled_internal
@@ -162,4 +194,38 @@ def advance_real(
     return (
         end, c[k.ARC_LENGTH], c[k.LATERAL_ERROR], c[k.HEADING_ERROR], c[k.SPEED_ERROR],
         int(c[k.CLIPPED]), c[k.REWARD], c[j], c[j + 1], c[j + 2], c[j + 3], c[j + 4], c[j + 5],
+    )  # fmt: skip
+
+
+@compiled
+def command_real(data: Array, m: Array, spec: Array) -> tuple[Any, Any, int]:
+    """Begin a control period of a plant that is not the kernels' bicycle.
+
+    Returns the mean acceleration that the drive gives over it (m/s^2), the angle at which the
+    wheels stand at its end (rad), and the bits of what was clipped.
+    """
+    memory, constants = data[k.MEMORY : k.CONSTANTS], data[k.CONSTANTS : k.OBSERVATION]
+    bits = take_command(m, memory, data[0], data[1], spec, constants)
+    queue = m[real.TAIL : real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM])]
+    substeps, now = int(constants[k.SUBSTEPS]), memory[k.STEPS] * constants[k.PERIOD]
+    h = constants[k.PERIOD] / substeps
+    braking = stop_acceleration(m, constants)
+    m[real.MEAN_A] = m[real.MEAN_DELTA] = 0.0
+    for i in range(substeps):
+        a, delta = serve(m, queue, braking, now + i * h, h)
+        m[real.MEAN_A] += a / substeps
+        m[real.MEAN_DELTA] += delta / substeps
+    return m[real.MEAN_A], m[real.SERVO_DELTA] + m[real.STEERING_OFFSET], bits
+
+
+@compiled
+def conclude_real(
+    data: Array, table: Array, m: Array, spec: Array, work: Array, draws: Array, state: Array,
+    bits: int,
+) -> int:  # fmt: skip
+    """End a control period that another plant has driven to a `state` (6,)."""
+    return end_period(
+        m, data[k.MEMORY : k.CONSTANTS], state[0], state[1], state[2], state[3], state[4],
+        state[5], bits, spec, data[k.CONSTANTS : k.OBSERVATION], table,
+        data[k.OBSERVATION :].view(np.float32), draws[0], draws[1], work,
     )  # fmt: skip

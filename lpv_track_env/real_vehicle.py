@@ -130,37 +130,43 @@ def stop_acceleration(m: Array, constants: Array) -> Any:
 
 
 @compiled_internal
-def move(m: Array, queue: Array, memory: Array, constants: Array, now: Any) -> tuple[
-    Any, Any, Any, Any, Any, Any
-]:  # fmt: skip
+def serve(m: Array, queue: Array, braking: Any, begins: Any, h: Any) -> tuple[Any, Any]:
+    """Let the servos work for h seconds; means of what they report over them, a and delta.
+
+    First order, exactly; the means are what an integrator that holds its inputs wants. `braking` is
+    the acceleration of a vehicle that stops by itself.
+    """
+    lag, ends, dead = m[real.DRIVE_LAG], begins + h, m[real.DRIVE_DEAD_TIME]
+    kept = math.exp(-h / lag) if lag > 0.0 else 0.0
+    wanted = braking if m[real.STOPPING] > 0.5 else held(m, queue, 1, begins - dead, ends - dead)
+    behind = m[real.SERVO_A] - wanted
+    a = wanted + behind * ((1.0 - kept) * lag / h)
+    m[real.SERVO_A] = wanted + behind * kept
+    lag, dead = m[real.STEERING_LAG], m[real.STEERING_DEAD_TIME]
+    kept = math.exp(-h / lag) if lag > 0.0 else 0.0
+    wanted = held(m, queue, 2, begins - dead, ends - dead)
+    behind = m[real.SERVO_DELTA] - wanted
+    delta = wanted + behind * ((1.0 - kept) * lag / h)
+    m[real.SERVO_DELTA] = wanted + behind * kept
+    return a, delta
+
+
+@compiled_internal
+def move(
+    m: Array, queue: Array, memory: Array, constants: Array, now: Any
+) -> tuple[Any, Any, Any, Any, Any, Any]:
     """State after a control period of the real vehicle; notes servos and mean inputs in `m`."""
     p, q = constants, real.PLANT
     substeps = int(p[k.SUBSTEPS])
     h = p[k.PERIOD] / substeps
-    drive_lag, steering_lag = m[real.DRIVE_LAG], m[real.STEERING_LAG]
-    drive_kept = math.exp(-h / drive_lag) if drive_lag > 0.0 else 0.0
-    steering_kept = math.exp(-h / steering_lag) if steering_lag > 0.0 else 0.0
     vx, vy, psi, r = memory[VX], memory[VY], memory[PSI], memory[YAW_RATE]
     x, y = memory[X], memory[Y]
-    servo_a, servo_delta = m[real.SERVO_A], m[real.SERVO_DELTA]
-    wheelbase = m[q + 2] + m[q + 3]
-    load = m[q] * GRAVITY / wheelbase * m[real.FRICTION]
+    load = m[q] * GRAVITY / (m[q + 2] + m[q + 3]) * m[real.FRICTION]
     total_a = total_delta = 0.0
     windy = m[real.WIND_SPEED] > 0.0 or m[real.GUST_SPEED] > 0.0
-    stopping = m[real.STOPPING] > 0.5
-    braking = stop_acceleration(m, p) if stopping else 0.0
+    braking = stop_acceleration(m, p)
     for i in range(substeps):
-        begins = now + i * h
-        ends = begins + h
-        dead = m[real.DRIVE_DEAD_TIME]
-        wanted = braking if stopping else held(m, queue, 1, begins - dead, ends - dead)
-        # Mean of the first-order response over the step: the integrator holds its inputs.
-        a = wanted + (servo_a - wanted) * ((1.0 - drive_kept) * drive_lag / h)
-        servo_a = wanted + (servo_a - wanted) * drive_kept
-        dead = m[real.STEERING_DEAD_TIME]
-        wanted = held(m, queue, 2, begins - dead, ends - dead)
-        delta = wanted + (servo_delta - wanted) * ((1.0 - steering_kept) * steering_lag / h)
-        servo_delta = wanted + (servo_delta - wanted) * steering_kept
+        a, delta = serve(m, queue, braking, now + i * h, h)
         total_a += a
         total_delta += delta
         wheels = delta + m[real.STEERING_OFFSET]
@@ -179,6 +185,5 @@ def move(m: Array, queue: Array, memory: Array, constants: Array, now: Any) -> t
         )  # fmt: skip
         vy += 0.5 * h * push
         r += 0.5 * h * spin
-    m[real.SERVO_A], m[real.SERVO_DELTA] = servo_a, servo_delta
     m[real.MEAN_A], m[real.MEAN_DELTA] = total_a / substeps, total_delta / substeps
     return vx, vy, psi, r, x, y

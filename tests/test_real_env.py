@@ -442,3 +442,34 @@ def test_a_vehicle_gone_mad_ends_as_non_finite() -> None:
     assert terminated
     assert info["end"] in {"non_finite", "left_corridor"}
     assert np.isfinite(info["estimate"]).all()
+
+
+@pytest.mark.parametrize("plant", ["single-track", "drift"])
+def test_other_plants_meet_the_same_conditions(plant: str) -> None:
+    """Ideal ones change nothing; sensors, actuators and delays are those of the bicycle."""
+    car = VEHICLES["bmw-320i"]
+    actions = random_actions(40)
+    one = PathTrackingEnv("T2", car, plant=plant)
+    other = PathTrackingEnv("T2", car, plant=plant, conditions=IDEAL)
+    one.reset(seed=0)
+    other.reset(seed=0)
+    for action in actions:
+        ours, theirs = one.step(action), other.step(action)
+        # The mean of what is held is summed up: rounding.
+        np.testing.assert_allclose(ours[4]["state"], theirs[4]["state"], atol=1e-9)
+    late = Conditions(estimator="ekf", steering_lag=0.1, steering_dead_time=0.03, drive_lag=0.2,
+                      computing_delay=0.01, gnss_noise=0.05)  # fmt: skip
+    bicycle = PathTrackingEnv("T2", car, conditions=late)
+    foreign = PathTrackingEnv("T2", car, plant=plant, conditions=late)
+    for env in (bicycle, foreign):
+        env.reset(seed=3)
+    for action in actions:
+        told = [env.step(action)[4] for env in (bicycle, foreign)]
+        assert bicycle.actuators == pytest.approx(foreign.actuators, abs=1e-12)
+        errors = [info["estimate"] - info["state"] for info in told]
+        # The same noise of the same receiver, on another car's position.
+        assert np.abs(errors[0] - errors[1]).max() < 0.05
+        assert 0.0 < np.hypot(*errors[1][[X, Y]]) < 0.3
+    copied = pickle.loads(pickle.dumps(foreign))  # noqa: S301
+    for action in actions[:5]:
+        np.testing.assert_array_equal(foreign.step(action)[0], copied.step(action)[0])

@@ -1,11 +1,12 @@
 """One control period of a single environment whose plant is not the kernels' bicycle."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lpv_track_env import kernels
+from lpv_track_env import kernels, real_env
 from lpv_track_env.plants import Plant
 
 Array = NDArray[np.float64]
@@ -27,18 +28,30 @@ class PlantEpisode:
         """Take over the state and the steering angle that an episode begins with."""
         self.plant.begin(memory[:6].copy(), float(memory[kernels.STEERING]))
 
-    def advance(self, episode: Array, table: Array) -> tuple[float, ...]:
-        """Drive one control period in place: arguments and result as of `kernels.advance`."""
+    def advance(self, episode: Array, table: Array, *real: Any) -> tuple[float, ...]:
+        """Drive one control period in place: arguments and result as of `kernels.advance`.
+
+        Under conditions, with those of `real_env.advance_real`: what they do to sensors, actuators
+        and commands holds for every plant; mass, tyres and wind are the plant's own.
+        """
         end = kernels.NOT_FINITE
         if math.isfinite(episode[0]) and math.isfinite(episode[1]):
-            a, delta, bits = kernels.command(episode)
+            if real:
+                memory, spec = real[:2]
+                a, delta, bits = real_env.command_real(episode, memory, spec)
+            else:
+                a, delta, bits = kernels.command(episode)
             period = float(episode[kernels.CONSTANTS + kernels.PERIOD])
             try:
-                state = self.plant.advance(a, delta, period)
+                state = np.asarray(self.plant.advance(a, delta, period), dtype=np.float64)
             except (ArithmeticError, ValueError):
                 state = np.full(6, np.nan)
-            vx, vy, psi, r, x, y = state.tolist()
-            end = kernels.conclude(episode, table, vx, vy, psi, r, x, y, a, delta, bits)
+            if real:
+                given: Any = (episode, table, *real, state, bits)
+                end = real_env.conclude_real(*given)
+            else:
+                vx, vy, psi, r, x, y = state.tolist()
+                end = kernels.conclude(episode, table, vx, vy, psi, r, x, y, a, delta, bits)
         told = episode[kernels.MEMORY : kernels.CONSTANTS].tolist()[kernels.ARC_LENGTH :]
         clipped = kernels.CLIPPED - kernels.ARC_LENGTH
         return end, *told[:clipped], int(told[clipped]), *told[clipped + 1 :]
