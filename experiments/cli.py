@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.engines import one_thread
+from experiments.parallel.options import SETTINGS
+from experiments.parallel.options import add_options as add_parallel_options
 
 EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
@@ -134,6 +136,14 @@ def parser() -> argparse.ArgumentParser:
     verify.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores"
     )
+
+    add_parallel_options(
+        add(
+            "run-parallel",
+            "Drive in real time with estimator and controller as processes of their own.",
+            "lpv-track run-parallel --trajectory T2 --seconds 60 --rate 50",
+        )
+    )
     return root
 
 
@@ -196,7 +206,23 @@ def run(options: argparse.Namespace) -> int:
             solver=options.solver or SOLVER,
             console=console,
         )
-    return _trajectories(options, console)
+    handler = _run_parallel if options.command == "run-parallel" else _trajectories
+    return handler(options, console)
+
+
+def _run_parallel(options: argparse.Namespace, console: object) -> int:
+    from rich.console import Console
+
+    from experiments.benchmark import parse_settings
+    from experiments.parallel import command
+    from experiments.parallel.setup import Setup
+
+    assert isinstance(console, Console)
+    if options.bench_mailbox:
+        return command.bench(options.out, console)
+    settings = {name: getattr(options, name) for name in SETTINGS}
+    setup = Setup(**settings, agent_settings=parse_settings(options.agent_set))
+    return command.run_parallel(setup, options.out, console)
 
 
 def _benchmark(options: argparse.Namespace, console: object) -> int:
