@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
+import trajectories
 from experiments.parallel.bench import bench_mailbox
 from experiments.parallel.figures import picture
 from experiments.parallel.recording import Outcome
@@ -44,11 +45,10 @@ def run_parallel(setup: Setup, folder: Path, console: Console) -> int:
 
     outcome = run(setup, say)
     result["machine"]["load_average_after"] = load()
-    env = setup.task_env()
-    summary = summarise(setup, outcome, env.path, env.vehicle)
+    summary = summarise(setup, outcome)
     result["run"] = summary
     write(result, folder / RUN_FILE)
-    drawn = picture(setup, outcome, summary, env.path)
+    drawn = picture(setup, outcome, summary, trajectories.load(setup.trajectory))
     if drawn is not None:
         write_atomically(folder / "run.png", drawn)
         console.print(table(setup, summary))

@@ -45,8 +45,8 @@ def control(link: Link, setup: Setup, estimates: Reader, commands: Writer) -> No
     env = setup.task_env()
     agent = setup.make_agent(env)
     observer = PathObserver(env.path, env.layout)
-    start = env.path.sample(0.0)
-    state = np.array([start.speed, 0.0, start.heading, 0.0, start.x, start.y])
+    path = env.path
+    state = np.array([path.speed[0], 0.0, path.heading[0], 0.0, path.x[0], path.y[0]])
     observer.begin(state, near=0.0)
     for k in range(WARM_UP):
         observation = observer.observe(state, env.vehicle.rolling_deceleration, 0.0)

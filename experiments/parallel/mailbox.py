@@ -24,6 +24,7 @@ would remove the mailbox when such a child ends).
 """
 
 import os
+import secrets
 import select
 import struct
 import time
@@ -85,12 +86,13 @@ class Mailbox:
         if slots < 2:
             raise ValueError(f"a mailbox needs at least 2 slots, not {slots}")
         self.dtype, self.slots = dtype, slots
-        self._memory = SharedMemory(create=True, size=FRONT + slots * _stride(dtype))
+        # A name that tells whose it is, should anybody ever look.
+        name = f"lpv-track-{os.getpid()}-{secrets.token_hex(4)}"
+        self._memory = SharedMemory(name, create=True, size=FRONT + slots * _stride(dtype))
         self._linked = True
         waiting, waking = Pipe(duplex=False)
         for connection in (waiting, waking):
             os.set_blocking(connection.fileno(), False)
-        name = self._memory.name
         self.writer = Writer(name, dtype, slots, waking)
         self.reader = Reader(name, dtype, slots, waiting)
         """The one reader that can wait."""

@@ -21,7 +21,7 @@ from typing import Any
 ATTACHED, READY, FAILED = "attached", "ready", "failed"
 DEATH_SIGNAL, TIMER_SLACK = 1, 29
 """prctl's PR_SET_PDEATHSIG and PR_SET_TIMERSLACK."""
-GRACE = 1.0
+GRACE = 0.5
 """s that a child has to end by itself, and then to die of SIGTERM, before it is killed."""
 
 

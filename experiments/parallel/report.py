@@ -9,13 +9,12 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from experiments import metrics
+from experiments.metrics import rms
 from experiments.parallel.messages import DRIVING, REASONS, STALE_PERIODS
 from experiments.parallel.recording import Outcome, Recording
 from experiments.parallel.setup import Setup
+from experiments.rollout import Trace
 from lpv_track_env.bicycle import PSI, VX, X, Y
-from lpv_track_env.vehicle import VehicleParameters
-from trajectories import ReferencePath
 
 Array = NDArray[np.float64]
 Summary = dict[str, Any]
@@ -37,9 +36,7 @@ def spread(values: Array) -> Summary | None:
     }
 
 
-def summarise(
-    setup: Setup, outcome: Outcome, path: ReferencePath, vehicle: VehicleParameters
-) -> Summary:
+def summarise(setup: Setup, outcome: Outcome) -> Summary:
     """Everything that is reported of a run, plain values; times in s, lengths in m."""
     recording = outcome.recording
     summary: Summary = {
@@ -53,10 +50,7 @@ def summarise(
         "faults": faults(setup, outcome),
     }  # fmt: skip
     if len(recording.rows) > 1:
-        tracked = metrics.tracking(recording.trace(), path, vehicle)
-        summary["tracking"] = {
-            name: tracked[name] for name in ("mle", "ale", "moe", "aoe", "rms_speed_error")
-        }
+        summary["tracking"] = tracking(recording.trace())
         summary["estimation"] = estimation(recording)
     summary["complete"] = outcome.end in COMPLETE
     summary["held"] = summary["periods"] > 0 and summary["answered_share"] >= HELD
@@ -66,16 +60,19 @@ def summarise(
 def timing(setup: Setup, recording: Recording) -> Summary:
     """Rate, deadlines and latencies."""
     applied = recording.applied()
+    # While no estimate comes, the last one is answered again and again.
+    _, first = np.unique(applied["period"], return_index=True)
+    applied = {name: column[first] for name, column in applied.items()}
     periods = max(len(recording.rows) - 1, 0)
     in_time = applied["latency"] <= setup.period
-    answered = np.unique(applied["period"][in_time & (applied["period"] < periods)]).size
+    answered = int(np.sum(in_time & (applied["period"] < periods)))
     solves = applied["solve_time"][applied["solve_time"] > 0.0]
     share = answered / periods if periods else 0.0
     return {
         "periods": periods,
-        "answered_in_time": int(answered),
+        "answered_in_time": answered,
         "answered_share": share,
-        "deadline_misses": periods - int(answered),
+        "deadline_misses": periods - answered,
         "rate": setup.rate * share,
         "wake_to_action": spread(applied["latency"]),
         "stages": {
@@ -109,6 +106,17 @@ def faults(setup: Setup, outcome: Outcome) -> Summary:
         },
         "failed_solves": int(applied["failures"].max(initial=0)),
         "commands_refused": outcome.commands_refused,
+    }
+
+
+def tracking(trace: Trace) -> Summary:
+    """Errors of the true vehicle, as `experiments.metrics` defines them."""
+    return {
+        "mle": float(np.abs(trace.lateral_error).max()),
+        "ale": rms(trace.time, trace.lateral_error),
+        "moe": float(np.abs(trace.heading_error).max()),
+        "aoe": rms(trace.time, trace.heading_error),
+        "rms_speed_error": rms(trace.time, trace.state[:, VX] - trace.reference_speed),
     }
 
 

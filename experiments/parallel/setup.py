@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import agents
+import trajectories
 from agents.registry import check_settings
 from lpv_track_env import vehicle
 from lpv_track_env.conditions import IDEAL, Conditions, load
@@ -83,6 +84,7 @@ class Setup:
         check_settings(self.agent, self.agent_settings)
         vehicle.load(self.vehicle)
         load(self.conditions)
+        trajectories.load(self.trajectory)
 
     @property
     def period(self) -> float:

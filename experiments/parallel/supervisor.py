@@ -88,13 +88,14 @@ class Supervisor:
         self._commands = commands.reader.open()
         self._estimates = estimates.watcher().open()
         self._watchers.append(self._estimates)
-        self._children = [
-            Child("estimator", context, estimate, (self.setup, samples.reader, estimates.writer)),
-            Child("controller", context, control, (self.setup, estimates.reader, commands.writer)),
-        ]
+        for name, role, ends in (
+            ("estimator", estimate, (samples.reader, estimates.writer)),
+            ("controller", control, (estimates.reader, commands.writer)),
+        ):
+            self._children.append(Child(name, context, role, (self.setup, *ends)))
         # So that a reader sees when its writer is gone, and the other way round.
-        for given in (samples.reader, estimates.writer, estimates.reader, commands.writer):
-            given.close()
+        for end in (samples.reader, estimates.writer, estimates.reader, commands.writer):
+            end.close()
         if self._all_say(ATTACHED):
             for mailbox in self._mailboxes:
                 mailbox.unlink()
