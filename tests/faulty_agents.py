@@ -14,7 +14,7 @@ class Hangs:
         self.rolling = task.vehicle.rolling_deceleration
         self.calls = 0
 
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+    def predict(self, _observation, state=None, **_):
         self.calls += 1
         if self.calls > WARM_UP + 8:
             time.sleep(3600.0)

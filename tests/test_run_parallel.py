@@ -290,7 +290,7 @@ class Constant:
         self.action = np.array([0.5, 0.1])
         self.error: Exception | None = None
 
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+    def predict(self, _observation, state=None, **_):
         if self.error is not None:
             raise self.error
         return self.action, state
@@ -391,7 +391,9 @@ def test_failed_solves_brake_and_ten_in_a_row_end_the_process(
     for _ in range(control.MAX_FAILURES - 1):
         controller.answer(an_estimate(controller), 1)
         assert controller.command["reason"] == FAILED
-    with pytest.raises(RuntimeError, match="10 times in a row, last with ValueError: .*not finite"):
+    with pytest.raises(
+        RuntimeError, match=r"10 times in a row, last with ValueError: .*not finite"
+    ):
         controller.answer(an_estimate(controller), 1)
 
 
