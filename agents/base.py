@@ -69,14 +69,10 @@ class DrivingTask:
         TypeError
             If the environment is not one of path tracking.
         """
-        inner = env.unwrapped
+        inner: Any = env.unwrapped
         try:
             return cls(
-                inner.layout,
-                inner.vehicle,
-                inner.control_period,
-                inner.path,
-                inner.actuation,  # type: ignore[attr-defined]
+                inner.layout, inner.vehicle, inner.control_period, inner.path, inner.actuation
             )
         except AttributeError as error:
             raise TypeError(

@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from lpv_track_env import kernels
 from lpv_track_env.task import Task
 from lpv_track_env.vector_env import PathTrackingVectorEnv
-from lpv_track_env.vector_infos import single_info
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 
@@ -118,7 +116,7 @@ class TrackingVecEnv(VecEnv):
         self._reset_options()
         self._returns[:] = 0.0
         self._lengths[:] = 0
-        self.reset_infos = [single_info(memory) for memory in self.env.memories]
+        self.reset_infos = [self.env.info_of(i) for i in range(self.num_envs)]
         return observations
 
     def step_async(self, actions: Array) -> None:
@@ -133,10 +131,9 @@ class TrackingVecEnv(VecEnv):
         done = terminated | truncated
         infos: Infos = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(done).tolist():
-            memory, observation = self.env.final_of(i)
+            info, observation = self.env.final_of(i)
             infos[i] = {
-                **single_info(memory),
-                "end": kernels.END_NAMES[int(memory[kernels.END])],
+                **info,
                 "terminal_observation": observation,
                 "TimeLimit.truncated": bool(truncated[i]),
                 "episode": {
@@ -145,7 +142,7 @@ class TrackingVecEnv(VecEnv):
                     "t": round(time.time() - self._made, 6),
                 },
             }
-            self.reset_infos[i] = single_info(self.env.memories[i])
+            self.reset_infos[i] = self.env.info_of(i)
             self._returns[i], self._lengths[i] = 0.0, 0
         return observations, rewards.astype(np.float32), done, infos
 

@@ -20,7 +20,7 @@ import trajectories
 from agents.registry import check_settings, source_file
 from experiments import metrics
 from experiments.rollout import Rollout, rollout
-from lpv_track_env import vehicle
+from lpv_track_env import conditions, vehicle
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.naming import choose
 from lpv_track_env.task import SPEED_MODES
@@ -39,6 +39,7 @@ ENV_SETTINGS = tuple(
 class Case:
     """Everything that determines one episode.
 
+    `conditions` is a preset's name or a dictionary of fields, see `lpv_track_env.conditions.load`.
     `vehicle_changes` replaces fields of the vehicle, for the plant and the agents' models alike
     (say, a wider `max_lateral_velocity_ratio`); `agent_settings` and `env_settings` are keyword
     arguments of the agent's class and of the environment.
@@ -47,7 +48,7 @@ class Case:
     agent: str
     trajectory: str
     vehicle: str = "m2-minibus"
-    conditions: str = "simulation"
+    conditions: str | Mapping[str, Any] = "simulation"
     seed: int = 0
     speed_mode: str = "variable"
     fixed_speed: float | None = None
@@ -84,10 +85,16 @@ class Case:
         vehicle.load(self.vehicle)
         trajectories.load(self.trajectory)
         choose("speed mode", self.speed_mode, SPEED_MODES)
+        conditions.load(self.plain_conditions)
         for key in self.env_settings:
             choose("environment setting", key, ENV_SETTINGS)
         for key in self.vehicle_changes:
             choose("vehicle field", key, VEHICLE_FIELDS)
+
+    @property
+    def plain_conditions(self) -> str | dict[str, Any]:
+        """Conditions as the environment takes them; JSON's lists are ranges."""
+        return self.conditions if isinstance(self.conditions, str) else dict(self.conditions)
 
     def make_env(self, **settings: Any) -> gymnasium.Env[Any, Any]:
         """The case's environment; `settings` are added to the case's own."""
@@ -104,7 +111,7 @@ class Case:
             vehicle=car,
             speed_mode=self.speed_mode,
             fixed_speed=self.fixed_speed,
-            conditions=self.conditions,
+            conditions=self.plain_conditions,
             control_period=self.control_period,
             **{**self.env_settings, **settings},
         )

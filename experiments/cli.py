@@ -40,7 +40,9 @@ def parser() -> argparse.ArgumentParser:
         "lpv-track benchmark --agents stanley lqr --trajectories T1 T2 --out results/mine",
     )
     benchmark.add_argument(
-        "--suite", default="paper", help="paper (default), quick, converged, sideslip or frozen"
+        "--suite",
+        default="paper",
+        help="paper (default), quick, realtime, converged, sideslip or frozen",
     )
     benchmark.add_argument(
         "--agents", nargs="+", metavar="NAME", help="default: all; your own: file.py:Class"
@@ -50,6 +52,13 @@ def parser() -> argparse.ArgumentParser:
     )
     benchmark.add_argument("--vehicles", nargs="+", metavar="NAME", help="presets or .json files")
     benchmark.add_argument("--speed-modes", nargs="+", choices=["variable", "fixed"])
+    benchmark.add_argument(
+        "--conditions", metavar="NAME", help="simulation (default), realtime or ideal"
+    )
+    benchmark.add_argument(
+        "--conditions-set", nargs="+", default=[], metavar="KEY=VALUE",
+        help="fields to change, e.g. gnss_noise=0.3 computing_delay=[0.01,0.05]",
+    )  # fmt: skip
     benchmark.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="seeds 0..N-1 (default 1)"
     )
@@ -89,6 +98,8 @@ def parser() -> argparse.ArgumentParser:
     drive.add_argument("--trajectory", default="T2", metavar="NAME")
     drive.add_argument("--vehicle", default="m2-minibus", metavar="NAME")
     drive.add_argument("--speed-mode", default="variable", choices=["variable", "fixed"])
+    drive.add_argument("--conditions", default="simulation", metavar="NAME")
+    drive.add_argument("--conditions-set", nargs="+", default=[], metavar="KEY=VALUE")
     drive.add_argument("--seed", type=int, default=0)
     drive.add_argument("--agent-set", nargs="+", default=[], metavar="KEY=VALUE")
     drive.add_argument("--env", nargs="+", default=[], metavar="KEY=VALUE")
@@ -177,6 +188,7 @@ def run(options: argparse.Namespace) -> int:
             trajectory=options.trajectory,
             vehicle=options.vehicle,
             speed_mode=options.speed_mode,
+            conditions=conditions_of(options),
             seed=options.seed,
             agent_settings=parse_settings(options.agent_set),
             env_settings=parse_settings(options.env),
@@ -256,6 +268,8 @@ def _benchmark(options: argparse.Namespace, console: object) -> int:
     }
     if options.control_period is not None:
         common["control_period"] = options.control_period
+    if options.conditions is not None or options.conditions_set:
+        specs = [{**spec, "conditions": conditions_of(options)} for spec in specs]
     specs = distinct([merged(spec, common) for spec in specs])
     settings = {"suite": suite, "agents": names, "seeds": list(seeds), **common}
     try:
@@ -267,6 +281,15 @@ def _benchmark(options: argparse.Namespace, console: object) -> int:
         console.print(f"interrupted: the same command with --resume goes on from {options.out}")
         return EXIT_INTERRUPTED
     return finish(store, specs, console)
+
+
+def conditions_of(options: argparse.Namespace) -> str | dict[str, Any]:
+    """Conditions by name, or a dictionary of what departs from them."""
+    from experiments.benchmark import parse_settings
+
+    changes = parse_settings(options.conditions_set)
+    name = options.conditions or "simulation"
+    return {"name": name, **changes} if changes else name
 
 
 def merged(spec: dict[str, object], changes: dict[str, Any]) -> dict[str, object]:

@@ -115,10 +115,30 @@ def violations(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) ->
     return result
 
 
+def knowledge(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
+    """How well the estimate knew the vehicle, and how often commands or fixes failed to come.
+
+    All zero under ideal conditions. The lateral error of the estimate is across the path.
+    """
+    del vehicle
+    foot = path.sample(trace.arc_length)
+    dx, dy = (trace.estimate[:, k] - trace.state[:, k] for k in (X, Y))
+    distance = np.hypot(dx, dy)
+    across = dy * np.cos(foot.heading) - dx * np.sin(foot.heading)
+    return {
+        "rms_estimate_error": rms(trace.time, distance),
+        "max_estimate_error": float(distance.max()),
+        "rms_lateral_estimate_error": rms(trace.time, across),
+        "stopping_share": float(np.mean(trace.stopping[1:])) if trace.time.size > 1 else 0.0,
+        "deadline_misses": float(trace.deadline_misses[-1]),
+    }
+
+
 METRICS: tuple[Callable[[Trace, ReferencePath, VehicleParameters], dict[str, float]], ...] = (
     tracking,
     activity,
     violations,
+    knowledge,
 )
 """Every function's entries go into a case's `metrics`; add your own here."""
 

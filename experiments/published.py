@@ -31,7 +31,11 @@ REALTIME: dict[str, tuple[float, ...]] = {
 """Rows of the runs with the vehicle, in the same order."""
 
 
-def row(trajectory: str) -> dict[str, float] | None:
-    """Published simulation row of a trajectory or of its raw form, by column; None for others."""
-    values = SIMULATION.get(trajectory.removesuffix("-raw"))
+def row(trajectory: str, conditions: object = "simulation") -> dict[str, float] | None:
+    """Published row of a trajectory or of its raw form, by column; None for others.
+
+    The simulation's under ideal conditions, under all others that of the runs with the vehicle.
+    """
+    rows = SIMULATION if conditions == "simulation" else REALTIME
+    values = rows.get(trajectory.removesuffix("-raw"))
     return None if values is None else dict(zip(COLUMNS, values, strict=True))

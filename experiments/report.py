@@ -166,7 +166,7 @@ def summary(cases: Sequence[Result], superseded: int) -> str:
         paragraph(
             "ALE and MLE over the trajectories of the setting, of all runs that did not fail; an "
             "episode that ended early counts for the part it drove. “ALE against published” "
-            "is the mean over T1 to T6 of ours divided by the published simulation value.",
+            "is the mean over T1 to T6 of ours divided by the published value of the same kind.",
             "soft",
         )
     )
@@ -223,7 +223,8 @@ def _against_published(cases: Iterable[Result]) -> str:
         case["metrics"]["ale"] / row["ale"]
         for case in cases
         if case.get("trajectory") in published.SIMULATION
-        and (row := published.row(str(case["trajectory"]))) is not None
+        and (row := published.row(str(case["trajectory"]), case.get("conditions", "simulation")))
+        is not None
     ]
     return f"{100 * np.mean(shares):.0f} %" if shares else "–"
 

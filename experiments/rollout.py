@@ -20,13 +20,16 @@ Array = NDArray[np.float64]
 class Trace:
     """What happened at the ends of n control periods, and (index 0) at the start: arrays (n + 1,).
 
-    `state` is (n + 1, 6): vx, vy, psi, r, X, Y. `acceleration` and `steering_angle` are the
-    actuators' values in force during the period that ends there. `solve_time` (s) is the agent's
-    whole `predict` call of that period, 0 at the start.
+    `state` is (n + 1, 6): vx, vy, psi, r, X, Y; `estimate` is what the observation was made of,
+    under ideal conditions the state itself. `acceleration` and `steering_angle` are the actuators'
+    values in force at the end of the period (under ideal conditions, all through it). `solve_time`
+    (s) is the agent's whole `predict` call of that period, 0 at the start. `stopping` marks periods
+    in which the vehicle braked by itself, `deadline_misses` counts computations that came too late.
     """
 
     time: Array
     state: Array
+    estimate: Array
     arc_length: Array
     lateral_error: Array
     heading_error: Array
@@ -36,6 +39,8 @@ class Trace:
     solve_time: Array
     reward: Array
     clipped: Array
+    stopping: Array
+    deadline_misses: Array
 
     def as_dict(self) -> dict[str, Array]:
         """Arrays by name."""
@@ -67,31 +72,39 @@ def rollout(
     seed: int | None = None,
     options: dict[str, Any] | None = None,
     on_step: Callable[[int, dict[str, Any]], None] | None = None,
+    computing_time: Callable[[int, float], tuple[float, float]] | None = None,
 ) -> Rollout:
     """Drive one episode from reset to its end.
 
     `on_step(k, info)` is called after each step, with the agent's diagnostics under "agent".
+    `computing_time(k, seconds)`, given the time that the agent just took, says what passes until
+    the action of step k lands and until the next may be computed (s, s), see
+    `PathTrackingEnv.set_computing_time`.
     """
     observation, info = env.reset(seed=seed, options=options)
     inner: Any = env.unwrapped
-    layout, period = inner.layout, inner.control_period
+    period = inner.control_period
     rows: list[list[float]] = []
     states: list[Array] = []
+    estimates: list[Array] = []
 
     def note(info: dict[str, Any], seconds: float, reward: float) -> None:
-        seen = layout.unpack(observation)
+        acceleration, steering_angle = inner.actuators
         states.append(info["state"])
+        estimates.append(info.get("estimate", info["state"]))
         rows.append(
             [
                 info["arc_length"],
                 info["lateral_error"],
                 info["heading_error"],
                 float(info["state"][0] - info["speed_error"]),
-                float(seen.acceleration),
-                float(seen.steering_angle),
+                acceleration,
+                steering_angle,
                 seconds,
                 reward,
                 float(info["clipped"]),
+                float(info.get("stopping", False)),
+                float(info.get("deadline_misses", 0)),
             ]
         )
 
@@ -110,6 +123,8 @@ def rollout(
         action, memory = agent.predict(observation, memory, episode_start=start)
         seconds = time.perf_counter() - began
         start = np.array([False])
+        if computing_time is not None:
+            inner.set_computing_time(*computing_time(len(rows) - 1, seconds))
         observation, reward, terminated, truncated, info = env.step(action)
         done = terminated or truncated
         note(info, seconds, float(reward))
@@ -125,7 +140,12 @@ def rollout(
         if on_step is not None:
             on_step(len(rows) - 1, {**info, "agent": told})
     table = np.array(rows).T
-    trace = Trace(period * np.arange(len(rows)), np.array(states).reshape(-1, STATE_SIZE), *table)
+    trace = Trace(
+        period * np.arange(len(rows)),
+        np.array(states).reshape(-1, STATE_SIZE),
+        np.array(estimates).reshape(-1, STATE_SIZE),
+        *table,
+    )
     return Rollout(
         trace=trace,
         end=str(info["end"]),

@@ -11,6 +11,7 @@ Spec = dict[str, Any]
 SIX = tuple(PUBLISHED)
 RAW = tuple(f"{name}-raw" for name in SIX)
 RAW_PREVIEW = {"preview_steps": 30, "preview_period": 0.1}
+LEAST_SEEDS = 10
 DEMONSTRATION = "lpv-mpc-frozen"
 """An agent that shows why not to drive so."""
 
@@ -49,7 +50,7 @@ def quick(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
 
 
 def paper(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
-    """The paper's six in both speed modes and as raw waypoints, and with the other vehicle.
+    """The paper's six in both speed modes, as raw waypoints, with the other vehicle, in real time.
 
     On raw waypoints a corner must be seen 3 s ahead to be cut: agents get 30 preview steps of
     0.1 s there. IPOPT's NMPC, which takes a hundred times as long as all others together, drives
@@ -61,9 +62,16 @@ def paper(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
         *grid(fast, RAW, seeds=seeds, env_settings=RAW_PREVIEW),
         *grid(fast, SIX, speed_modes=("fixed",), seeds=seeds),
         *grid(fast, SIX, vehicles=("course-car",), seeds=seeds),
+        *realtime(fast, seeds),
     ]
     # The slow ones first, over all settings, so that no worker ends alone with one of them.
     return sorted(specs, key=lambda spec: spec["agent"] not in solved)
+
+
+def realtime(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
+    """The six under the conditions of a real vehicle, at least ten seeds, that intervals mean."""
+    several = seeds if len(seeds) >= LEAST_SEEDS else range(LEAST_SEEDS)
+    return grid(agent_names, SIX, seeds=several, conditions="realtime")
 
 
 def converged(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
@@ -107,6 +115,7 @@ SUITES = {
     "paper": paper,
     "quick": quick,
     "sideslip": sideslip,
+    "realtime": realtime,
     "converged": converged,
     "frozen": frozen,
 }

@@ -47,8 +47,8 @@ SYMBOLS = {
 PUBLISHED_LABEL = "published"
 PUBLISHED_DECIMALS = 2
 PUBLISHED_NOTE = (
-    "Published rows: kumar2025lpv, simulation. Its vehicle, weights and paths are not public, so "
-    "they stand beside ours for orientation."
+    "Published rows: kumar2025lpv; simulation, and beside other conditions its runs with the "
+    "vehicle. Its vehicle, weights and paths are not public: they stand there for orientation."
 )
 
 
@@ -102,6 +102,9 @@ FURTHER = (
     Column("max_speed_error", "max speed error", "m/s", 3),
     Column("steering_rate_rms", "rms steering rate", "rad/s", 3),
     Column("jerk_rms", "rms jerk", "m/s³", 3),
+    Column("rms_estimate_error", "rms error of the estimate", "m", 3),
+    Column("deadline_misses", "deadline misses", "", 1),
+    Column("stopping_share", "share braking by itself", "", 3),
     Column("duration", "duration", "s", 1),
 )
 """What the paper's table leaves out; "by the clock" is the distance to where the reference is."""
@@ -162,13 +165,21 @@ def setting_of(case: Result) -> str:
     parts.append(speed)
     if _raw(case):
         parts.append("raw waypoints")
-    if case.get("conditions", "simulation") != "simulation":
-        parts.append(f"conditions {case['conditions']}")
+    if (given := case.get("conditions", "simulation")) != "simulation":
+        parts.append(f"conditions {conditions_words(given)}")
     if case.get("control_period", Case.control_period) != Case.control_period:
         parts.append(f"control period {case['control_period']} s")
     if changed := case.get("env_settings"):
         parts.append(f"env {_changes(changed)}")
     return " · ".join(parts)
+
+
+def conditions_words(given: str | Mapping[str, Any]) -> str:
+    """Name of conditions, and what departs from them."""
+    if isinstance(given, str):
+        return given
+    rest = {key: value for key, value in given.items() if key != "name"}
+    return f"{given.get('name', 'ideal')} with {_changes(rest)}" if rest else str(given["name"])
 
 
 def label_of(case: Result) -> str:
@@ -287,7 +298,8 @@ def build_rows(cases: Iterable[Result]) -> list[Row]:
         groups.setdefault(key, {}).setdefault(label_of(case), []).append(case)
     rows = []
     for (setting, trajectory), by_label in groups.items():
-        reference = published.row(trajectory)
+        conditions = next(iter(by_label.values()))[0].get("conditions", "simulation")
+        reference = published.row(trajectory, conditions)
         if reference is not None:
             values = {key: Estimate(value) for key, value in reference.items()}
             rows.append(Row(setting, trajectory, PUBLISHED_LABEL, values, published=True))

@@ -31,16 +31,16 @@ COUNT = len(DRAWN)
 PLANT = COUNT
 """the true vehicle's parameters, 7 in `PARAMETER_ORDER`;"""
 (
-    SERVO_A, SERVO_DELTA, COMMAND_A, COMMAND_DELTA, NEWEST, QUEUED, FREE_AT, LATENCY,
-    OCCUPIED, MISSES, STOPPING, MEAN_A, MEAN_DELTA, WIND_X, WIND_Y, GUST, WANDER_X, WANDER_Y,
+    SERVO_A, SERVO_DELTA, COMMAND_A, COMMAND_DELTA, NEWEST, QUEUED, FREE_AT, LATENCY, OCCUPIED,
+    DEVIATION, STOPPING, MISSES, MEAN_A, MEAN_DELTA, WIND_X, WIND_Y, GUST, WANDER_X, WANDER_Y,
     OUTAGE_END, NEXT_FIX, WAITING, DRIFT, FIX_X, FIX_Y, READ_SPEED, READ_YAW_RATE, READ_HEADING,
-) = range(PLANT + len(PARAMETER_ORDER), PLANT + len(PARAMETER_ORDER) + 27)  # fmt: skip
+) = range(PLANT + len(PARAMETER_ORDER), PLANT + len(PARAMETER_ORDER) + 28)  # fmt: skip
 """actuators as they report (a, delta), last accepted command, places in the queue of commands, when
-the controller is free again (s), latency and occupation of the
-next computation if somebody measured them (s, else -1), deadline misses, whether it brakes to a
-stop, mean reported inputs over the last period, the wind's direction and gust, GNSS, the readings
-of this period;"""
-ESTIMATE = PLANT + len(PARAMETER_ORDER) + 27
+the controller is free again (s), latency and occupation of the next computation if somebody
+measured them (s, else -1), standard deviation of the position (m), whether the vehicle brakes to a
+stop, deadline misses, mean reported inputs over the last period, the wind's direction and gust,
+GNSS, the readings of this period;"""
+ESTIMATE = PLANT + len(PARAMETER_ORDER) + 28
 """the estimate, a memory as `kernels` has it;"""
 TAIL = ESTIMATE + kernels.MEMORY_SIZE
 """commands on their way (landing time s, a, delta), fixes on theirs (arrival s, stamp, x, y), and
@@ -129,7 +129,7 @@ class RealArrays(NamedTuple):
 
     def info(self) -> dict[str, Any]:
         """What infos have besides those of ideal conditions."""
-        return info_of(self.memory, self.spec)
+        return single_report(self.memory)
 
 
 def filter_start(spec: Array) -> int:
@@ -137,14 +137,28 @@ def filter_start(spec: Array) -> int:
     return TAIL + COMMAND * int(spec[QUEUE_ROOM]) + WAY * int(spec[FIX_ROOM])
 
 
-def info_of(memory: Array, spec: Array) -> dict[str, Any]:
+REPORTED = (*range(ESTIMATE, ESTIMATE + 6), DEVIATION, STOPPING, MISSES)
+"""Entries of a memory that infos show: a report, (9,)."""
+
+
+def single_report(memory: Array) -> dict[str, Any]:
     """Infos of one vehicle: estimate (6,), position_deviation, stopping, deadline_misses."""
-    deviation = math.nan
-    if spec[ESTIMATOR] == EKF:
-        deviation = filtering.deviation_of(memory, filter_start(spec))
     return {
         "estimate": memory[ESTIMATE : ESTIMATE + 6].copy(),
-        "position_deviation": deviation,
+        "position_deviation": float(memory[DEVIATION]),
         "stopping": bool(memory[STOPPING]),
         "deadline_misses": int(memory[MISSES]),
     }
+
+
+def reports_infos(reports: Array, mask: Array) -> dict[str, Any]:
+    """The same of many vehicles, from reports (n, 9), for those that `mask` (n,) marks."""
+    shown = np.where(mask[:, None], reports, 0.0)
+    infos: dict[str, Any] = {
+        "estimate": shown[:, :6].copy(),
+        "position_deviation": shown[:, 6].copy(),
+        "stopping": shown[:, 7] > 0.5,
+        "deadline_misses": shown[:, 8].astype(np.int64),
+    }
+    infos.update({f"_{name}": mask for name in list(infos)})
+    return infos

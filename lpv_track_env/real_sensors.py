@@ -66,7 +66,7 @@ def receive_satellites(
 
 
 @compiled_internal
-def arrived(m: Array, ways: Array, now: Any) -> bool:
+def arrived(m: Array, ways: Array, now: Any) -> Any:
     """Whether the oldest fix on its way has arrived."""
     return m[real.WAITING] > 0.5 and ways[0] <= now + 1e-9
 
@@ -113,6 +113,7 @@ def estimate(
     if kind == real.EKF:
         for j in range(6):
             e[j] = filter_memory[j]
+        m[real.DEVIATION] = filtering.position_deviation(filter_memory)
     elif kind == real.RAW:
         e[VX], e[VY], e[YAW_RATE] = m[real.READ_SPEED], 0.0, m[real.READ_YAW_RATE]
         e[PSI], e[X], e[Y] = m[real.READ_HEADING], m[real.FIX_X], m[real.FIX_Y]
@@ -135,6 +136,7 @@ def begin_estimate(
     read_sensors(m, memory, key, episode, draw, 0.0)
     for j in range(6):
         e[j] = memory[j]
+    m[real.DEVIATION] = math.nan
     if kind == real.TRUTH:
         return
     e[VX], e[VY], e[YAW_RATE] = m[real.READ_SPEED], 0.0, m[real.READ_YAW_RATE]
@@ -152,3 +154,4 @@ def begin_estimate(
     filtering.correlate(f, PSI, filtering.HEADING_BIAS)
     filtering.correlate(f, YAW_RATE, filtering.GYRO_BIAS)
     filtering.begin_filter(f, 0.0)
+    m[real.DEVIATION] = filtering.position_deviation(f)

@@ -13,14 +13,16 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels, vector_kernels
+from lpv_track_env.conditions import Conditions
 from lpv_track_env.draws import random_key
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.episodes import GIVEN, given_start
 from lpv_track_env.naming import choose
+from lpv_track_env.real_vector import RealVector
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task, action_space
 from lpv_track_env.threads import checked_threads, shares, using_threads
-from lpv_track_env.vector_infos import episode_infos, final_infos
+from lpv_track_env.vector_infos import episode_infos, final_infos, single_info
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 
@@ -119,7 +121,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         ),
         speed_mode: str = "variable",
         fixed_speed: float | None = None,
-        conditions: str = "simulation",
+        conditions: str | Conditions | dict[str, Any] = "simulation",
         control_period: float = 0.05,
         render_mode: str | None = None,
         *,
@@ -156,6 +158,11 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._paths, self._cars = paths, cars
         self._drawn = (0, len(paths), len(cars))
         self.tasks = self._tasks_of(paths, cars)
+        self._real: RealVector | None = None
+        if (given := self._single.conditions) is not None:
+            self._real = RealVector(
+                given, self.num_envs, self._single.control_period, self._threads
+            )
         self._pack(self.tasks)
         self.single_observation_space = self._single.observation_space
         self.single_action_space = action_space([task.vehicle for task in self.tasks])
@@ -195,6 +202,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
                 tables.append(task.path.table)
             rows.append((first, first + len(tables[-1])))
         self._tables, self._rows = np.concatenate(tables), np.array(rows)
+        if self._real is not None:
+            self._real.pack(tasks)
 
     def task_of(self, index: int) -> Task:
         """Task of the current episode of environment `index`: its path, its vehicle."""
@@ -223,9 +232,20 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         """Memories of the current episodes, (n, `kernels.MEMORY_SIZE`), to read."""
         return self._memories
 
-    def final_of(self, index: int) -> tuple[Array, Array]:
-        """Last memory and observation of environment `index`, which just ended in SAME_STEP."""
-        return self._final_memories[index].copy(), self._final_observations[index].copy()
+    def info_of(self, index: int) -> Infos:
+        """Info of environment `index`, as the single environment gives it, without its end."""
+        info = single_info(self._memories[index])
+        if self._real is not None:
+            info.update(self._real.single_info(index))
+        return info
+
+    def final_of(self, index: int) -> tuple[Infos, Array]:
+        """Last info and observation of environment `index`, which just ended in SAME_STEP."""
+        memory = self._final_memories[index]
+        info = {**single_info(memory), "end": kernels.END_NAMES[int(memory[kernels.END])]}
+        if self._real is not None:
+            info.update(self._real.final_info(index))
+        return info, self._final_observations[index].copy()
 
     @property
     def state(self) -> Array:
@@ -262,11 +282,23 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             super().reset(seed=seed)
         self._take_keys(seeds, mask)
         self._pack_beside(tasks if tasks is not self.tasks else [], mask)
-        vector_kernels.begin_all(
-            mask, self._memories, self._cases, drawn, self._constants, self._tables, self._rows,
-            self._keys, self._episodes, given, self._observations, self._ends,
-        )  # fmt: skip
-        return self._observations.copy(), episode_infos(self._memories, mask)
+        if self._real is None:
+            vector_kernels.begin_all(
+                mask, self._memories, self._cases, drawn, self._constants, self._tables,
+                self._rows, self._keys, self._episodes, given, self._observations, self._ends,
+            )  # fmt: skip
+        else:
+            self._real.begin(
+                mask, self._keys, self._episodes,
+                (
+                    self._memories, self._cases, drawn, self._constants, self._tables, self._rows,
+                    given, self._observations, self._ends,
+                ),
+            )  # fmt: skip
+        infos = episode_infos(self._memories, mask)
+        if self._real is not None:
+            infos.update(self._real.infos(mask))
+        return self._observations.copy(), infos
 
     def _pack_beside(self, extra: list[Task], mask: Array) -> None:
         """Pack the constructor's tasks, `extra` ones, and what unmarked episodes still use."""
@@ -294,8 +326,12 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         observations, rewards, terminated, truncated = self.advance(actions)
         infos = episode_infos(self._memories)
         ended = terminated | truncated
+        if self._real is not None:
+            infos.update(self._real.infos(np.ones(self.num_envs, dtype=np.bool_)))
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
             infos.update(final_infos(self._final_memories, self._final_observations, ended))
+            if self._real is not None:
+                infos["final_info"].update(self._real.final_infos(ended))
         return observations, rewards, terminated, truncated, infos
 
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array]:
@@ -304,6 +340,16 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         commands = self._checked_actions(actions)
         n = self.num_envs
         rewards = np.empty(n)
+        if self._real is not None:
+            self._real.advance(
+                self._mode, self._keys, self._episodes,
+                (
+                    self._memories, commands, self._cases, self._drawn, self._constants,
+                    self._tables, self._rows, self._nothing_given, self._observations, self._ends,
+                    rewards, self._final_memories, self._final_observations,
+                ),
+            )  # fmt: skip
+            return self._outcome(rewards)
         arguments = (
             self._mode, self._memories, commands, self._cases, self._drawn, self._constants,
             self._tables, self._rows, self._keys, self._episodes, self._nothing_given,
@@ -315,6 +361,9 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             with using_threads(self._threads):
                 chunks = len(self._scratch)
                 vector_kernels.advance_in_threads(chunks, n, *arguments, self._scratch)
+        return self._outcome(rewards)
+
+    def _outcome(self, rewards: Array) -> tuple[Array, Array, Array, Array]:
         ended = self._ends != kernels.RUNNING
         truncated = self._ends == kernels.TIME_LIMIT
         # A copy: a reset of some environments hands out the others' observations again.

@@ -10,8 +10,14 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from lpv_track_env import bicycle, kernels, lpv
-from lpv_track_env.bicycle import LOW_SPEED, compiled_field, compiled_inverse_speed, derivative
-from lpv_track_env.task import LONGEST_SUBSTEP, POLE_STEP
+from lpv_track_env.bicycle import (
+    LONGEST_SUBSTEP,
+    LOW_SPEED,
+    POLE_STEP,
+    compiled_field,
+    compiled_inverse_speed,
+    derivative,
+)
 from lpv_track_env.vehicle import COURSE_CAR, GRAVITY, M2_MINIBUS, VEHICLES, VehicleParameters
 
 Array = NDArray[np.float64]

@@ -168,6 +168,11 @@ class ClosedLoop:
     def __init__(self, envs: PathTrackingVectorEnv, agent: RtiNmpc, *, threads: int = 1) -> None:
         if envs.autoreset_mode is not AutoresetMode.DISABLED:
             raise ValueError("a closed loop needs environments with autoreset_mode='Disabled'")
+        if envs.single.conditions is not None:
+            raise ValueError(
+                "a closed loop in compiled code knows conditions 'simulation' only: step the "
+                "environments and let the agent predict"
+            )
         if envs.single.layout != agent.task.layout:
             raise ValueError(
                 f"the agent is made for {agent.task.layout}, the environments have "
