@@ -233,7 +233,11 @@ def _run_parallel(options: argparse.Namespace, console: object) -> int:
     if options.bench_mailbox:
         return command.bench(options.out, console)
     settings = {name: getattr(options, name) for name in SETTINGS}
-    setup = Setup(**settings, agent_settings=parse_settings(options.agent_set))
+    setup = Setup(
+        **settings,
+        conditions=conditions_of(options),
+        agent_settings=parse_settings(options.agent_set),
+    )
     return command.run_parallel(setup, options.out, console)
 
 

@@ -122,9 +122,9 @@ def test_a_run_to_its_end() -> None:
     assert (applied["estimated"] > 0.0).all()
     assert outcome.final_speed < 0.02
     # It was driven: on the path, over about the distance of its speed.
-    trace = outcome.recording.trace()
-    assert np.abs(trace.lateral_error).max() < 0.5
-    assert trace.arc_length[-1] > 0.5 * trace.state[0, 0]
+    driven = outcome.recording.driven()
+    assert np.abs(driven.lateral_error).max() < 0.5
+    assert driven.arc_length[-1] > 0.5 * driven.state[0, 0]
     summary = report.summarise(SLOW, outcome)
     assert summary["periods"] == 20
     assert summary["complete"]

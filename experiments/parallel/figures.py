@@ -10,10 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from experiments.figures import COLOURS
-from experiments.parallel.recording import Outcome, Recording
+from experiments.parallel.recording import Driven, Outcome, Recording
 from experiments.parallel.report import Summary
 from experiments.parallel.setup import Setup
-from experiments.rollout import Trace
 from lpv_track_env.bicycle import VX, X, Y
 from trajectories import ReferencePath
 
@@ -23,17 +22,17 @@ def picture(setup: Setup, outcome: Outcome, summary: Summary, path: ReferencePat
     recording = outcome.recording
     if len(recording.rows) < 2:
         return None
-    trace = recording.trace()
+    driven = recording.driven()
     figure = Figure(figsize=(13.0, 8.5), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 2)
     _latencies(panels[0, 0], setup, recording)
     _distribution(panels[0, 1], setup, recording)
-    _errors(panels[1, 0], outcome, trace)
-    _map(panels[1, 1], recording, trace, path)
+    _errors(panels[1, 0], outcome, driven)
+    _map(panels[1, 1], recording, driven, path)
     figure.suptitle(
         f"lpv-track run-parallel: {setup.agent} on {setup.trajectory}, {setup.estimator}, "
-        f"{setup.conditions}; {summary['rate']:.2f} of {setup.rate} Hz, "
+        f"{setup.conditions_name}; {summary['rate']:.2f} of {setup.rate} Hz, "
         f"{summary['deadline_misses']} deadline misses; end: {outcome.end}"
     )
     buffer = io.BytesIO()
@@ -86,22 +85,22 @@ def _plain(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _errors(ax: Axes, outcome: Outcome, trace: Trace) -> None:
-    ax.plot(trace.time, trace.lateral_error, color=COLOURS[0], linewidth=1.0)
+def _errors(ax: Axes, outcome: Outcome, driven: Driven) -> None:
+    ax.plot(driven.time, driven.lateral_error, color=COLOURS[0], linewidth=1.0)
     ax.set_xlabel("time, s")
     ax.set_ylabel("lateral error (truth), m")
     for one in outcome.stale_brakings:
-        ended = trace.time[-1] if one.ended is None else one.ended
+        ended = driven.time[-1] if one.ended is None else one.ended
         ax.axvspan(one.began, ended, color=COLOURS[3], alpha=0.3)
     speed = ax.twinx()
-    speed.plot(trace.time, trace.state[:, VX], color=COLOURS[1], linewidth=0.8)
+    speed.plot(driven.time, driven.state[:, VX], color=COLOURS[1], linewidth=0.8)
     speed.set_ylabel("speed, m/s", color=COLOURS[1])
     ax.grid(visible=True, alpha=0.3)
 
 
-def _map(ax: Axes, recording: Recording, trace: Trace, path: ReferencePath) -> None:
+def _map(ax: Axes, recording: Recording, driven: Driven, path: ReferencePath) -> None:
     ax.plot(path.x, path.y, color="lightgrey", linewidth=3.0, label="path")
-    ax.plot(trace.state[:, X], trace.state[:, Y], color=COLOURS[0], linewidth=1.0, label="driven")
+    ax.plot(driven.state[:, X], driven.state[:, Y], color=COLOURS[0], linewidth=1.0, label="driven")
     estimates = np.array([one["state"] for one in recording.estimates.values()])
     if estimates.size:
         ax.plot(

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 SETTINGS = (
-    "trajectory", "agent", "vehicle", "conditions", "estimator", "rate", "seconds", "seed",
+    "trajectory", "agent", "vehicle", "estimator", "rate", "seconds", "seed",
     "watchdog",
 )  # fmt: skip
 """Options that are fields of `Setup` as they stand."""
@@ -19,6 +19,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--conditions", default="realtime", metavar="NAME", help="realtime, ideal or simulation"
     )
+    parser.add_argument("--conditions-set", nargs="+", default=[], metavar="KEY=VALUE")
     parser.add_argument(
         "--estimator", default="ekf", metavar="NAME", help="ekf, or truth: the true state"
     )

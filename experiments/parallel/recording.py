@@ -1,13 +1,12 @@
 """What a run leaves behind: a row for every control period, and one for every command applied."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiments.parallel.vehicle import StaleBraking, Vehicle
-from experiments.rollout import Trace
 
 Array = NDArray[np.float64]
 
@@ -21,7 +20,7 @@ class Recording:
     """Filled in while driving; times in s."""
 
     rows: list[tuple[Any, ...]] = field(default_factory=list)
-    """Of control periods, at their beginnings: time, state, info and inputs in force."""
+    """Of control periods, at their beginnings, see `Driven`."""
     commands: list[tuple[float, ...]] = field(default_factory=list)
     """Of applied commands, see APPLIED."""
     estimates: dict[int, Any] = field(default_factory=dict)
@@ -34,11 +33,10 @@ class Recording:
     def note(self, vehicle: Vehicle) -> None:
         """Add the vehicle as it is at the beginning of a control period."""
         info = vehicle.info
-        speed = float(info["state"][0])
         self.rows.append(
             (
                 vehicle.time, info["state"], info["arc_length"], info["lateral_error"],
-                info["heading_error"], speed - info["speed_error"], *vehicle.in_force,
+                info["heading_error"], info["speed_error"], *vehicle.in_force,
                 vehicle.braking is not None,
             )
         )  # fmt: skip
@@ -48,28 +46,27 @@ class Recording:
         table = np.array(self.commands, dtype=float).reshape(-1, len(APPLIED)).T
         return dict(zip(APPLIED, table, strict=True))
 
-    def trace(self) -> Trace:
-        """What was driven, as `experiments.metrics` takes it; n + 1 rows for n control periods."""
-        columns = list(zip(*self.rows, strict=True))
-        zeros = np.zeros(len(self.rows))
-        solve_time = zeros.copy()
-        for row in self.commands:
-            period = int(row[0])
-            if period + 1 < len(solve_time):
-                solve_time[period + 1] = row[APPLIED.index("solve_time")]
-        return Trace(
-            time=np.array(columns[0]),
-            state=np.array(columns[1]),
-            arc_length=np.array(columns[2]),
-            lateral_error=np.array(columns[3]),
-            heading_error=np.array(columns[4]),
-            reference_speed=np.array(columns[5]),
-            acceleration=np.array(columns[6]),
-            steering_angle=np.array(columns[7]),
-            solve_time=solve_time,
-            reward=zeros,
-            clipped=zeros,
-        )
+    def driven(self) -> "Driven":
+        """What was driven, from the rows."""
+        columns = [np.array(column) for column in zip(*self.rows, strict=True)]
+        return Driven(*columns)
+
+
+class Driven(NamedTuple):
+    """The true vehicle at the beginnings of n + 1 control periods: arrays (n + 1,), SI units."""
+
+    time: Array
+    state: Array
+    """[vx, vy, psi, r, X, Y], (n + 1, 6)."""
+    arc_length: Array
+    lateral_error: Array
+    heading_error: Array
+    speed_error: Array
+    acceleration: Array
+    """What the actuators report."""
+    steering_angle: Array
+    braking: Array
+    """Whether it brakes for lack of a fresh command."""
 
 
 @dataclass(frozen=True)

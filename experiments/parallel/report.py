@@ -11,9 +11,8 @@ from rich.text import Text
 
 from experiments.metrics import rms
 from experiments.parallel.messages import DRIVING, REASONS, STALE_PERIODS
-from experiments.parallel.recording import Outcome, Recording
+from experiments.parallel.recording import Driven, Outcome, Recording
 from experiments.parallel.setup import Setup
-from experiments.rollout import Trace
 from lpv_track_env.bicycle import PSI, VX, X, Y
 
 Array = NDArray[np.float64]
@@ -50,7 +49,7 @@ def summarise(setup: Setup, outcome: Outcome) -> Summary:
         "faults": faults(setup, outcome),
     }  # fmt: skip
     if len(recording.rows) > 1:
-        summary["tracking"] = tracking(recording.trace())
+        summary["tracking"] = tracking(recording.driven())
         summary["estimation"] = estimation(recording)
     summary["complete"] = outcome.end in COMPLETE
     summary["held"] = summary["periods"] > 0 and summary["answered_share"] >= HELD
@@ -109,14 +108,14 @@ def faults(setup: Setup, outcome: Outcome) -> Summary:
     }
 
 
-def tracking(trace: Trace) -> Summary:
+def tracking(driven: Driven) -> Summary:
     """Errors of the true vehicle, as `experiments.metrics` defines them."""
     return {
-        "mle": float(np.abs(trace.lateral_error).max()),
-        "ale": rms(trace.time, trace.lateral_error),
-        "moe": float(np.abs(trace.heading_error).max()),
-        "aoe": rms(trace.time, trace.heading_error),
-        "rms_speed_error": rms(trace.time, trace.state[:, VX] - trace.reference_speed),
+        "mle": float(np.abs(driven.lateral_error).max()),
+        "ale": rms(driven.time, driven.lateral_error),
+        "moe": float(np.abs(driven.heading_error).max()),
+        "aoe": rms(driven.time, driven.heading_error),
+        "rms_speed_error": rms(driven.time, driven.speed_error),
     }
 
 
@@ -165,7 +164,7 @@ def table(setup: Setup, summary: Summary) -> Table:
             cells = [f"{1e3 * times[key]:.3f}" for key in ("median", "p99", "max")]
             rows.add_row(Text(name), *cells)
     rows.title = (
-        f"{setup.agent} on {setup.trajectory}, {setup.estimator}, {setup.conditions}: "
+        f"{setup.agent} on {setup.trajectory}, {setup.estimator}, {setup.conditions_name}: "
         f"{summary['rate']:.2f} of {setup.rate} Hz"
     )
     return rows

@@ -43,7 +43,7 @@ class Setup:
     seconds
         Length of the run, s; it ends before that where the path does.
     conditions
-        Of sensors, actuators and vehicle: a name that `lpv_track_env.conditions.load` knows.
+        Of sensors, actuators and vehicle: what `lpv_track_env.conditions.load` knows.
     estimator
         "ekf", or "truth": what the vehicle really does is passed on as the estimate.
     seed
@@ -63,7 +63,7 @@ class Setup:
     agent_settings: Mapping[str, Any] = field(default_factory=dict)
     rate: int = 50
     seconds: float = 60.0
-    conditions: str = "realtime"
+    conditions: str | dict[str, Any] = "realtime"
     estimator: str = "ekf"
     seed: int = 0
     watchdog: int = 25
@@ -110,6 +110,16 @@ class Setup:
     def tick_ms(self) -> int:
         """Time between the instants at which samples are taken, ms."""
         return math.gcd(self.period_ms, INERTIAL_MS, WHEEL_MS, self.fix_ms)
+
+    @property
+    def conditions_name(self) -> str:
+        """The conditions in words."""
+        if isinstance(self.conditions, str):
+            return self.conditions
+        return ", ".join(
+            f"{value}" if key == "name" else f"{key} {value}"
+            for key, value in self.conditions.items()
+        )
 
     @property
     def known_conditions(self) -> Conditions:
