@@ -35,7 +35,6 @@ from experiments.parallel.setup import Setup
 from experiments.parallel.supervisor import run
 from experiments.parallel.vehicle import Vehicle
 from lpv_track_env import conditions
-from lpv_track_env.observer import PathObserver
 from lpv_track_env.vehicle import VEHICLES
 
 ROOT = Path(__file__).parents[1]
@@ -298,12 +297,8 @@ class Constant:
 
 @pytest.fixture
 def controller() -> control.Controller:
-    setup = Setup()
-    env = setup.task_env()
-    observer = PathObserver(env.path, env.layout)
-    path = env.path
-    observer.begin([5.0, 0.0, path.heading[0], 0.0, path.x[0], path.y[0]], near=0.0)
-    return control.Controller(Constant(), observer, env.vehicle, setup)
+    made = control.prepared(Setup(agent="stanley"))
+    return control.Controller(Constant(), made._observer, BUS, Setup())
 
 
 def an_estimate(controller: control.Controller, age: float = 0.001) -> np.ndarray:
@@ -350,6 +345,22 @@ def test_the_controller_brakes_on_an_estimate_it_cannot_trust(
     # It goes on from there when the next is good.
     controller.answer(an_estimate(controller), 6)
     assert controller.command["reason"] == DRIVING
+
+
+def test_the_controller_finds_its_place_again_after_estimates_that_were_missed(
+    controller: control.Controller,
+) -> None:
+    observer = controller._observer
+    path = observer.path
+    for s in (0.0, 0.1, 0.2, 20.2, 20.3, 62.0, 80.0, 80.1):
+        here = path.sample(s)
+        estimate = an_estimate(controller)
+        estimate["state"] = [5.0, 0.0, here.heading, 0.0, here.x, here.y]
+        estimate["fix_age"] = 3.0 if s == 20.2 else 0.0
+        controller.answer(estimate, 1)
+        # Round a corner the way is longer than the distance, by less than is looked around.
+        assert observer.arc_length == pytest.approx(s, abs=1e-3)
+        assert observer.lateral_error == pytest.approx(0.0, abs=1e-3)
 
 
 def test_the_controller_brakes_by_itself_when_no_estimate_comes(

@@ -68,11 +68,11 @@ WAYS: dict[str, Wait] = {
 
 def read(link: Link, reader: Reader, condition: Any, way: str, said: Connection) -> None:
     """Take the values and send back how long each was on its way, s."""
-    reader.open()
     wait = WAYS[way]
+    latencies: list[float] = []
+    reader.open()
     link.say(READY)
     quiet()
-    latencies: list[float] = []
     while reader.taken < VALUES + WARM_UP:  # One that was not taken in time is skipped.
         message = wait(reader, condition)
         now = time.monotonic_ns()
@@ -80,6 +80,7 @@ def read(link: Link, reader: Reader, condition: Any, way: str, said: Connection)
             raise TimeoutError(f"no value for {TIMEOUT:g} s")
         if message.sequence > WARM_UP:
             latencies.append(1e-9 * (now - message.stamp))
+    reader.close()
     said.send_bytes(np.array(latencies).tobytes())
 
 

@@ -21,12 +21,14 @@ from experiments.parallel.messages import (
 )
 from experiments.parallel.processes import ATTACHED, READY, Link, quiet
 from experiments.parallel.setup import Setup
-from lpv_track_env.bicycle import VX
+from lpv_track_env.bicycle import VX, X, Y
 from lpv_track_env.observer import PathObserver
 from lpv_track_env.vehicle import VehicleParameters
 
 WARM_UP = 20
 """Calls of `predict` before the clock starts."""
+FAR = 1.0
+"""m between two estimates, beyond which some were missed: less than the observer looks around."""
 MAX_FAILURES = 10
 """Failed calls of `predict` in a row after which the process gives up."""
 
@@ -39,9 +41,23 @@ def control(link: Link, setup: Setup, estimates: Reader, commands: Writer) -> No
     RuntimeError
         When the agent has failed ten times in a row; until then each failure is a command to brake.
     """
-    estimates.open()
-    commands.open()
-    link.say(ATTACHED)
+    with estimates, commands:
+        link.say(ATTACHED)
+        controller = prepared(setup)
+        link.say(READY)
+        quiet()
+        while not link.stopped():
+            message = estimates.wait(controller.patience(time.monotonic_ns()))
+            if message is not None:
+                controller.answer(message.value, message.stamp)
+                commands.put(controller.command)
+            elif controller.is_stale(time.monotonic_ns()):
+                controller.brake_on_stale()
+                commands.put(controller.command)
+
+
+def prepared(setup: Setup) -> "Controller":
+    """A controller whose agent has been asked some times, so that nothing is left to compile."""
     env = setup.task_env()
     agent = setup.make_agent(env)
     observer = PathObserver(env.path, env.layout)
@@ -51,17 +67,7 @@ def control(link: Link, setup: Setup, estimates: Reader, commands: Writer) -> No
     for k in range(WARM_UP):
         observation = observer.observe(state, env.vehicle.rolling_deceleration, 0.0)
         agent.predict(observation, episode_start=np.array([k == 0]))
-    controller = Controller(agent, observer, env.vehicle, setup)
-    link.say(READY)
-    quiet()
-    while not link.stopped():
-        message = estimates.wait(controller.patience(time.monotonic_ns()))
-        if message is not None:
-            controller.answer(message.value, message.stamp)
-            commands.put(controller.command)
-        elif controller.is_stale(time.monotonic_ns()):
-            controller.brake_on_stale()
-            commands.put(controller.command)
+    return Controller(agent, observer, env.vehicle, setup)
 
 
 class Controller:
@@ -89,6 +95,7 @@ class Controller:
         self._start = np.array([True])
         self._in_a_row = 0
         self._speed = 0.0
+        self._place = (math.inf, math.inf)
         self.command: NDArray[Any] = np.zeros((), COMMAND)
         """The last command; `taken` is 0 before there was one."""
 
@@ -108,29 +115,40 @@ class Controller:
         command["period"], command["taken"] = estimate["period"], estimate["taken"]
         command["estimated"] = estimated
         command["solve_time"] = 0.0
-        self._speed = float(estimate["state"][VX])
-        if self.is_stale(time.monotonic_ns()):
-            self._brake(STALE_ESTIMATE, float(estimate["steering_angle"]))
-        elif not np.isfinite(estimate["state"]).all():
+        state, steering_angle = estimate["state"], float(estimate["steering_angle"])
+        self._speed = float(state[VX])
+        if not np.isfinite(state).all():
             # Never to the observer, which goes on from where the vehicle was last.
             self._speed = math.nan
-            self._brake(NOT_FINITE, float(estimate["steering_angle"]))
+            self._brake(NOT_FINITE, steering_angle)
+            return
+        offset = float(estimate["steering_offset"])
+        # Also where nothing is driven, so as not to lose the place on the path.
+        self._follow(float(state[X]), float(state[Y]))
+        observation = self._observer.observe(
+            state, float(estimate["acceleration"]), steering_angle + offset
+        )
+        if self.is_stale(time.monotonic_ns()):
+            self._brake(STALE_ESTIMATE, steering_angle)
         elif estimate["fix_age"] > self._max_fix_age:
-            self._brake(NO_FIX, float(estimate["steering_angle"]))
+            self._brake(NO_FIX, steering_angle)
         else:
-            self._drive(estimate)
+            self._drive(observation, steering_angle, offset)
 
-    def _drive(self, estimate: Any) -> None:
+    def _follow(self, x: float, y: float) -> None:
+        """Find the place on the path again after estimates that were missed."""
+        moved = math.hypot(x - self._place[0], y - self._place[1])
+        if FAR < moved < math.inf:
+            near = self._observer.arc_length + moved
+            self._observer.begin([0.0, 0.0, 0.0, 0.0, x, y], near=near)
+        self._place = (x, y)
+
+    def _drive(
+        self, observation: NDArray[np.float32], steering_angle: float, offset: float
+    ) -> None:
         command = self.command
         began = time.perf_counter()
-        offset = float(estimate["steering_offset"])
         try:
-            observation = self._observer.observe(
-                estimate["state"],
-                float(estimate["acceleration"]),
-                float(estimate["steering_angle"]) + offset,
-            )
-            began = time.perf_counter()
             action, self._memory = self._agent.predict(
                 observation, self._memory, episode_start=self._start
             )
@@ -146,7 +164,7 @@ class Controller:
                     f"predict failed {MAX_FAILURES} times in a row, "
                     f"last with {type(error).__name__}: {error}"
                 ) from error
-            self._brake(FAILED, float(estimate["steering_angle"]))
+            self._brake(FAILED, steering_angle)
             return
         command["solve_time"] = time.perf_counter() - began
         command["reason"] = DRIVING

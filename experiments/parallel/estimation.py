@@ -98,19 +98,20 @@ FILTERS: dict[str, Callable[[Setup], Filter]] = {"ekf": Ekf, "truth": Truth}
 
 
 def estimate(link: Link, setup: Setup, samples: Reader, estimates: Writer) -> None:
-    """Estimate until the supervisor stops it; an estimate goes out with each control period.
+    """Estimate until the supervisor stops it; an estimate goes out with each control period."""
+    with samples, estimates:
+        link.say(ATTACHED)
+        make = FILTERS[setup.estimator]
+        record = np.zeros((), ESTIMATE)
+        warm_up(make(setup), record)
+        chosen = make(setup)
+        link.say(READY)
+        quiet()
+        serve(link, chosen, samples, estimates, record)
 
-    Samples that pile up, because this process was late, are all taken in before the next estimate.
-    """
-    samples.open()
-    estimates.open()
-    link.say(ATTACHED)
-    make = FILTERS[setup.estimator]
-    record = np.zeros((), ESTIMATE)
-    warm_up(make(setup), record)
-    chosen = make(setup)
-    link.say(READY)
-    quiet()
+
+def serve(link: Link, chosen: Filter, samples: Reader, estimates: Writer, record: Any) -> None:
+    """Take in samples as they come; those that piled up all before the next estimate."""
     published, last, lost = -1, 0, 0
     while not link.stopped():
         for message in samples.wait_all(LOOK):
@@ -118,7 +119,7 @@ def estimate(link: Link, setup: Setup, samples: Reader, estimates: Writer) -> No
             last = message.sequence
             sample = message.value
             chosen.take(sample)
-        if samples.taken == 0 or sample["period"] == published:
+        if last == 0 or sample["period"] == published:
             continue
         published = int(sample["period"])
         for name in ("period", "taken", "time", "acceleration", "steering_angle"):

@@ -64,7 +64,8 @@ class Mailbox:
     """The mailbox's memory and pipe, in the process that makes them and hands out the ends.
 
     The ends are given to processes as arguments of `multiprocessing.Process` (spawn); each calls
-    `open` where it is used and `close` where it is not. `unlink` comes once all have opened theirs.
+    `open` (or says `with`) where it is used and `close` where it is not. `unlink` comes once all
+    have opened theirs.
 
     Parameters
     ----------
@@ -141,6 +142,12 @@ class _End:
             self._buffer = self._memory.buf
             self._front = self._buffer[:8].cast("Q")
         return self
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         """Detach and close this process's end of the pipe."""
