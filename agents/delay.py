@@ -31,7 +31,9 @@ class DelayMemory:
         return len(self.commands)
 
     def __getitem__(self, row: int) -> "DelayRow":
-        return DelayRow(self.inner[row], self.feet[row])
+        # Policies without memory hand back none.
+        inner = None if self.inner is None else self.inner[row]
+        return DelayRow(inner, self.feet[row])
 
 
 @dataclass

@@ -139,8 +139,8 @@ def make(
     """
     cls = agent_class(name)
     check_settings(name, settings)
-    task = DrivingTask.of(env)
     try:
+        task = DrivingTask.of(env)
         agent: Agent = cls(task, **settings)
     except TypeError as error:
         raise ValueError(f"agent {name!r}: {error}") from error

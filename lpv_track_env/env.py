@@ -100,7 +100,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     Under other conditions than "simulation" the observation is made of an estimate, with everything
     else of the truth as ever, and there are also `estimate` (6,), `position_deviation` (m, of the
-    filter, in the worst direction; NaN without one), `stopping` (the vehicle brakes by itself:
+    filter, in the worst direction; 0 without one), `stopping` (the vehicle brakes by itself:
     no fixes or no commands for too long) and `deadline_misses` (so far in the episode).
 
     ## Arguments

@@ -231,7 +231,7 @@ class Estimator:
         -------
         str
             "used"; "gated", beyond its gate; "late", older than the filter's memory or than a fix
-            that was used; "duplicate"; or "not finite".
+            that came before it, or a second one for a step; "duplicate"; or "not finite".
         """
         self._check_begun()
         code = filtering.take_fix(

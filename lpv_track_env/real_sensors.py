@@ -136,7 +136,7 @@ def begin_estimate(
     read_sensors(m, memory, key, episode, draw, 0.0)
     for j in range(6):
         e[j] = memory[j]
-    m[real.DEVIATION] = math.nan
+    m[real.DEVIATION] = 0.0
     if kind == real.TRUTH:
         return
     e[VX], e[VY], e[YAW_RATE] = m[real.READ_SPEED], 0.0, m[real.READ_YAW_RATE]

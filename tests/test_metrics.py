@@ -37,6 +37,7 @@ def episode(arc_length, lateral=0.0, heading=0.0, period=0.1, **changes):
     arrays = {
         "time": period * np.arange(n),
         "state": state,
+        "estimate": state,
         "arc_length": arc_length,
         "lateral_error": lateral,
         "heading_error": heading,
@@ -46,6 +47,8 @@ def episode(arc_length, lateral=0.0, heading=0.0, period=0.1, **changes):
         "solve_time": full(0.0),
         "reward": full(0.1),
         "clipped": full(0.0),
+        "stopping": full(0.0),
+        "deadline_misses": full(0.0),
     }
     return Trace(**{**arrays, **changes})
 
@@ -254,3 +257,20 @@ def test_heading_errors_come_wrapped_from_the_environment():
     assert turned[-1] - turned[0] > 6.0
     assert np.abs(result["trace"]["heading_error"]).max() <= np.pi
     assert result["metrics"]["moe"] < 0.3
+
+
+def test_what_was_known_is_measured_against_what_was():
+    trace = drive()
+    estimate = trace.state + np.array([0.0, 0.0, 0.0, 0.0, 0.3, -0.4])
+    stopping, misses = np.zeros(101), np.minimum(np.arange(101), 7.0)
+    stopping[41:61] = 1.0
+    values = metrics.evaluate(
+        drive(estimate=estimate, stopping=stopping, deadline_misses=misses), straight(), CAR
+    )
+    assert values["rms_estimate_error"] == pytest.approx(0.5)
+    assert values["max_estimate_error"] == pytest.approx(0.5)
+    assert values["rms_lateral_estimate_error"] == pytest.approx(0.4)
+    assert values["stopping_share"] == pytest.approx(0.2)
+    assert values["deadline_misses"] == 7.0
+    ideal = metrics.evaluate(trace, straight(), CAR)
+    assert ideal["rms_estimate_error"] == ideal["stopping_share"] == ideal["deadline_misses"] == 0.0

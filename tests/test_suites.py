@@ -6,7 +6,7 @@ import pytest
 
 import agents
 from experiments.cases import Case
-from experiments.suites import DEMONSTRATION, RAW, SIX, SUITES, default_agents
+from experiments.suites import DEMONSTRATION, LEAST_SEEDS, RAW, SIX, SUITES, default_agents
 
 
 @pytest.mark.parametrize("suite", SUITES)
@@ -14,7 +14,12 @@ def test_cases_of_a_suite_are_valid_and_distinct(suite: str) -> None:
     specs = SUITES[suite](default_agents(), [0, 1])
     cases = [Case(**spec) for spec in specs]
     assert len({case.id for case in cases}) == len(cases) > 0
-    assert {case.seed for case in cases} == {0, 1}
+    ideal = [case for case in cases if case.conditions == "simulation"]
+    assert {case.seed for case in ideal} in (set(), {0, 1})
+    # Where chance has a say, intervals must mean something.
+    other = [case for case in cases if case.conditions != "simulation"]
+    assert {case.seed for case in other} in (set(), set(range(LEAST_SEEDS)))
+    assert len(ideal) + len(other) == len(cases)
 
 
 def test_default_agents_are_those_to_drive_with() -> None:
@@ -30,6 +35,7 @@ def test_what_ipopt_does_not_drive_in_one_suite_it_drives_in_another() -> None:
         suite: Counter(
             (spec["agent"], spec["trajectory"], spec["vehicle"], spec["speed_mode"])
             for spec in SUITES[suite](names, [0])
+            if spec.get("conditions") is None
         )
         for suite in ("paper", "converged")
     }
@@ -38,6 +44,15 @@ def test_what_ipopt_does_not_drive_in_one_suite_it_drives_in_another() -> None:
     assert {key[1:] for key in both if key[0] == solved} == fast
     assert {key[1] for key in counts["paper"] if key[0] == solved} == set(SIX)
     assert {key[1] for key in both} == {*SIX, *RAW}
+
+
+def test_realtime_drives_the_six_with_as_many_seeds_as_are_asked_for() -> None:
+    specs = SUITES["realtime"](["lpv-nmpc", "stanley"], range(20))
+    assert len(specs) == 2 * 6 * 20
+    assert {spec["conditions"] for spec in specs} == {"realtime"}
+    driven = Counter(spec["trajectory"] for spec in SUITES["paper"](["lpv-nmpc"], [0])
+                     if spec.get("conditions") == "realtime")  # fmt: skip
+    assert driven == dict.fromkeys(SIX, LEAST_SEEDS)
 
 
 def test_frozen_compares_both_forms_with_the_nmpc() -> None:
