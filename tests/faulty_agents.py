@@ -14,7 +14,7 @@ class Hangs:
         self.rolling = task.vehicle.rolling_deceleration
         self.calls = 0
 
-    def predict(self, _observation, state=None, **_):
+    def predict(self, _observation, state=None, *_, **__):
         self.calls += 1
         if self.calls > WARM_UP + 8:
             time.sleep(3600.0)
