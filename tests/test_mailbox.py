@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments.parallel import bench
 from experiments.parallel.mailbox import FRONT, Mailbox, MailboxError, Reader, Writer
 
 RECORD = np.dtype([("number", np.int64), ("values", np.int64, (50,)), ("sum", np.int64)])
@@ -229,6 +230,13 @@ def test_the_name_is_gone_while_both_sides_go_on() -> None:
         mailbox.watcher().open()
     mailbox.close()
     mailbox.close()  # Once more does no harm.
+
+
+def test_the_bench_measures_every_value_that_was_taken() -> None:
+    latencies = bench.measure("mailbox (pipe)", 30)
+    # A value that a busy machine's reader slept through is not among them.
+    assert 1 <= len(latencies) <= 30
+    assert (latencies > 0.0).all()
 
 
 def test_what_cannot_be_a_mailbox_is_refused() -> None:

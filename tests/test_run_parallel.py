@@ -488,6 +488,28 @@ def test_deadlines_and_latencies_of_a_run_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
+    ("end", "fault", "number", "held", "code", "said"),
+    [
+        ("seconds", "", 0, True, 0, ""),
+        ("finished", "", 0, True, 0, ""),
+        ("seconds", "", 0, False, 1, "the rate was not held: 5 of 10 periods"),
+        ("left_corridor", "", 0, True, 1, "the drive ended before its time: left_corridor"),
+        ("fault", "the estimator hangs", 0, True, 1, "the estimator hangs"),
+        ("SIGINT", "", signal.SIGINT, True, 130, ""),
+        ("SIGTERM", "the estimator hangs", signal.SIGTERM, True, 143, ""),
+    ],
+)
+def test_the_exit_code_tells_how_it_went(
+    end: str, fault: str, number: int, held: bool, code: int, said: str, capsys
+) -> None:
+    outcome = Outcome(end, fault, number, Recording(), [], (0.0, 0.0), 0.0, 0)
+    complete = end in report.COMPLETE
+    summary = {"complete": complete, "held": held, "deadline_misses": 5, "periods": 10}
+    assert verdict(outcome, summary) == code
+    assert capsys.readouterr().err.startswith(f"lpv-track: {said}" if said else "")
+
+
+@pytest.mark.parametrize(
     ("changes", "complaint"),
     [
         ({"rate": 30}, "--rate must divide 1000"),

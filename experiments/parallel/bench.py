@@ -66,14 +66,16 @@ WAYS: dict[str, Wait] = {
 }
 
 
-def read(link: Link, reader: Reader, condition: Any, way: str, said: Connection) -> None:
+def read(
+    link: Link, reader: Reader, condition: Any, way: str, values: int, said: Connection
+) -> None:
     """Take the values and send back how long each was on its way, s."""
     wait = WAYS[way]
     latencies: list[float] = []
     reader.open()
     link.say(READY)
     quiet()
-    while reader.taken < VALUES + WARM_UP:  # One that was not taken in time is skipped.
+    while reader.taken < values + WARM_UP:  # One that was not taken in time is skipped.
         message = wait(reader, condition)
         now = time.monotonic_ns()
         if message is None:
@@ -84,7 +86,7 @@ def read(link: Link, reader: Reader, condition: Any, way: str, said: Connection)
     said.send_bytes(np.array(latencies).tobytes())
 
 
-def measure(way: str) -> NDArray[np.float64]:
+def measure(way: str, values: int) -> NDArray[np.float64]:
     """Latencies of one way, s, from the writer's stamp to the reader having the value.
 
     A value that was not taken before the next is not among them.
@@ -94,7 +96,7 @@ def measure(way: str) -> NDArray[np.float64]:
     condition = context.Condition()
     heard, said = context.Pipe(duplex=False)
     writer = mailbox.writer.open()
-    child = Child("reader", context, read, (mailbox.reader, condition, way, said))
+    child = Child("reader", context, read, (mailbox.reader, condition, way, values, said))
     said.close()
     try:
         while not child.heard(READY):
@@ -103,7 +105,7 @@ def measure(way: str) -> NDArray[np.float64]:
             time.sleep(PAUSE)
         mailbox.unlink()
         record = np.zeros((), ESTIMATE)
-        for _ in range(VALUES + WARM_UP):
+        for _ in range(values + WARM_UP):
             time.sleep(PAUSE)
             writer.put(record)
             if WAYS[way] is by_condition:
@@ -142,7 +144,7 @@ def bench_mailbox(console: Console) -> dict[str, Any]:
         rows.add_column(heading, justify="left" if not heading else "right")
     found: dict[str, Any] = {}
     for way in WAYS:
-        latencies = measure(way)
+        latencies = measure(way, VALUES)
         figures = {
             "median": float(np.median(latencies)),
             "p99": float(np.percentile(latencies, 99)),
