@@ -130,9 +130,15 @@ class DelayCompensated:
         ahead.look_ahead_all(rows, memory.commands, self._settings, self._nodes, memory.feet)
         seen = rows[0] if given.ndim == 1 else rows
         action, memory.inner = self.agent.predict(seen, memory.inner, starts, deterministic)
-        memory.commands[:, 1:] = memory.commands[:, :-1]
+        memory.commands[:, 1:] = memory.commands[:, :-1].copy()
         memory.commands[:, 0] = np.atleast_2d(action)
         return action, memory
+
+    def hold(self, memory: DelayMemory | None = None) -> None:
+        """Let a control period pass in which nothing was computed: the last command stays."""
+        held = self._memory if memory is None else memory
+        if held is not None:
+            held.commands[:, 1:] = held.commands[:, :-1].copy()
 
     def diagnostics(self, memory: DelayRow) -> dict[str, Any]:
         """What the agent tells of its last step, its plan moved to where it belongs."""

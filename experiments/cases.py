@@ -19,6 +19,7 @@ import lpv_track_env
 import trajectories
 from agents.registry import check_settings, source_file
 from experiments import metrics
+from experiments.computing import ComputingTimes
 from experiments.rollout import Rollout, rollout
 from lpv_track_env import conditions, vehicle
 from lpv_track_env.env import PathTrackingEnv
@@ -40,6 +41,7 @@ class Case:
     """Everything that determines one episode.
 
     `conditions` is a preset's name or a dictionary of fields, see `lpv_track_env.conditions.load`.
+    `computing` makes computing times delays: arguments of `experiments.computing.ComputingTimes`.
     `vehicle_changes` replaces fields of the vehicle, for the plant and the agents' models alike
     (say, a wider `max_lateral_velocity_ratio`); `agent_settings` and `env_settings` are keyword
     arguments of the agent's class and of the environment.
@@ -56,6 +58,7 @@ class Case:
     vehicle_changes: Mapping[str, Any] = field(default_factory=dict)
     agent_settings: Mapping[str, Any] = field(default_factory=dict)
     env_settings: Mapping[str, Any] = field(default_factory=dict)
+    computing: Mapping[str, Any] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -86,6 +89,9 @@ class Case:
         trajectories.load(self.trajectory)
         choose("speed mode", self.speed_mode, SPEED_MODES)
         conditions.load(self.plain_conditions)
+        if self.computing and self.conditions == "simulation":
+            raise ValueError("computing times are delays, which conditions 'simulation' have not")
+        self.make_computing()
         for key in self.env_settings:
             choose("environment setting", key, ENV_SETTINGS)
         for key in self.vehicle_changes:
@@ -116,6 +122,12 @@ class Case:
             **{**self.env_settings, **settings},
         )
 
+    def make_computing(self) -> ComputingTimes | None:
+        """The case's computing times; None: those of its conditions."""
+        if not self.computing:
+            return None
+        return ComputingTimes(**self.computing, period=self.control_period, seed=self.seed)
+
     def make_agent(self, env: gymnasium.Env[Any, Any]) -> agents.Agent:
         """The case's agent for its environment."""
         return agents.make(self.agent, env, **self.agent_settings)
@@ -127,7 +139,10 @@ def project_digest() -> str:
     packages = (trajectories, lpv_track_env, agents)
     folders = [Path(str(package.__file__)).parent for package in packages]
     here = Path(__file__).parent
-    own = "".join((here / name).read_text() for name in ("cases.py", "rollout.py", "metrics.py"))
+    own = "".join(
+        (here / name).read_text()
+        for name in ("cases.py", "rollout.py", "metrics.py", "computing.py")
+    )
     return hashlib.sha256((source_digest(*folders) + own).encode()).hexdigest()[:16]
 
 
@@ -153,7 +168,8 @@ def run_case(spec: Mapping[str, Any]) -> dict[str, Any]:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             env = case.make_env()
-            driven = rollout(env, case.make_agent(env), seed=case.seed)
+            computing = case.make_computing()
+            driven = rollout(env, case.make_agent(env), seed=case.seed, computing_time=computing)
             car = env.unwrapped.vehicle  # type: ignore[attr-defined]
             env.close()
         measured = metrics.evaluate(driven.trace, driven.path, car)
@@ -178,6 +194,7 @@ def run_case(spec: Mapping[str, Any]) -> dict[str, Any]:
         "solver": solver_summary(driven),
         "warnings": sorted({*noted, *driven.path.metadata.get("warnings", [])}),
         "seconds": time.perf_counter() - began,
+        **({} if computing is None else {"latency": computing.summary()}),
         "trace": driven.trace.as_dict(),
     }
 
@@ -188,6 +205,8 @@ def solver_summary(driven: Rollout) -> dict[str, Any]:
     The first call, which may still compile or allocate, counts like every other.
     """
     calls = driven.trace.solve_time[1:]
+    # Zero where the agent was still busy.
+    calls = calls[calls > 0.0]
     return {
         "median": float(np.median(calls)),
         "p99": float(np.percentile(calls, 99)),

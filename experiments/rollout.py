@@ -79,7 +79,8 @@ def rollout(
     `on_step(k, info)` is called after each step, with the agent's diagnostics under "agent".
     `computing_time(k, seconds)`, given the time that the agent just took, says what passes until
     the action of step k lands and until the next may be computed (s, s), see
-    `PathTrackingEnv.set_computing_time`.
+    `PathTrackingEnv.set_computing_time`. While the agent is busy with an earlier action it is not
+    asked for the next; its `solve_time` is 0 there.
     """
     observation, info = env.reset(seed=seed, options=options)
     inner: Any = env.unwrapped
@@ -116,19 +117,24 @@ def rollout(
     solver_seconds: list[float] = []
     iterations: list[int] = []
     slack = np.zeros(3)
-    explain = getattr(agent, "diagnostics", None)
+    explain, hold = getattr(agent, "diagnostics", None), getattr(agent, "hold", None)
     done = False
     while not done:
-        began = time.perf_counter()
-        action, memory = agent.predict(observation, memory, episode_start=start)
-        seconds = time.perf_counter() - began
+        computed = not inner.controller_busy
+        seconds = 0.0
+        if computed:
+            began = time.perf_counter()
+            action, memory = agent.predict(observation, memory, episode_start=start)
+            seconds = time.perf_counter() - began
+        elif hold is not None:
+            hold(memory)
         start = np.array([False])
-        if computing_time is not None:
+        if computing_time is not None and computed:
             inner.set_computing_time(*computing_time(len(rows) - 1, seconds))
         observation, reward, terminated, truncated, info = env.step(action)
         done = terminated or truncated
         note(info, seconds, float(reward))
-        told = explain(memory[0]) if explain is not None else {}
+        told = explain(memory[0]) if explain is not None and computed else {}
         if told:
             statuses[told["status"]] = statuses.get(told["status"], 0) + 1
             if told["fallback"]:

@@ -143,7 +143,9 @@ def _departures(case: Result) -> int:
     """In how many respects a case's setting is not the default one."""
     names = ("vehicle", "speed_mode", "fixed_speed", "conditions", "control_period")
     changed = [case.get(name, getattr(Case, name)) != getattr(Case, name) for name in names]
-    extra = (_raw(case), case.get("vehicle_changes"), case.get("env_settings"))
+    extra = (
+        _raw(case), case.get("vehicle_changes"), case.get("env_settings"), case.get("computing"),
+    )  # fmt: skip
     return sum(map(bool, (*changed, *extra)))
 
 
@@ -167,6 +169,8 @@ def setting_of(case: Result) -> str:
         parts.append("raw waypoints")
     if (given := case.get("conditions", "simulation")) != "simulation":
         parts.append(f"conditions {conditions_words(given)}")
+    if given := case.get("computing"):
+        parts.append(f"computing {given['arrangement']} x {given.get('load', 1):g}")
     if case.get("control_period", Case.control_period) != Case.control_period:
         parts.append(f"control period {case['control_period']} s")
     if changed := case.get("env_settings"):

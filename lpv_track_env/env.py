@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lpv_track_env import episodes, kernels, real, real_env, vehicle
+from lpv_track_env import episodes, kernels, real, real_env, real_vehicle, vehicle
 from lpv_track_env.conditions import LONGEST_DELAY, Actuation, Conditions
 from lpv_track_env.conditions import load as load_conditions
 from lpv_track_env.draws import random_key
@@ -251,6 +251,14 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def actuators(self) -> tuple[float, float]:
         """Acceleration (m/s^2) and steering angle (rad) that the actuators have in force."""
         return float(self._memory[kernels.ACCELERATION]), float(self._memory[kernels.STEERING])
+
+    @property
+    def controller_busy(self) -> bool:
+        """Whether the controller still computes an earlier action: the next will be dropped."""
+        if self._real is None:
+            return False
+        now = self._memory[kernels.STEPS] * self.control_period
+        return bool(self._real.memory[real.FREE_AT] > now + real_vehicle.INSTANT)
 
     def set_computing_time(self, latency: float, occupied: float | None = None) -> None:
         """Say how long the next step's action took to compute, in place of `computing_delay`.

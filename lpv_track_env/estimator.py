@@ -58,7 +58,7 @@ class EstimatorSettings:
         If a value is not finite or is negative, or a deviation of a sensor is 0.
     """
 
-    position_deviation: float = 0.06
+    position_deviation: float = 0.045
     heading_deviation: float = 0.005
     yaw_rate_deviation: float = 0.004
     speed_deviation: float = 0.08

@@ -32,15 +32,16 @@ PLANT = COUNT
 """the true vehicle's parameters, 7 in `PARAMETER_ORDER`;"""
 (
     SERVO_A, SERVO_DELTA, COMMAND_A, COMMAND_DELTA, NEWEST, QUEUED, FREE_AT, LATENCY, OCCUPIED,
-    DEVIATION, STOPPING, MISSES, MEAN_A, MEAN_DELTA, WIND_X, WIND_Y, GUST, WANDER_X, WANDER_Y,
-    OUTAGE_END, NEXT_FIX, WAITING, DRIFT, FIX_X, FIX_Y, READ_SPEED, READ_YAW_RATE, READ_HEADING,
-) = range(PLANT + len(PARAMETER_ORDER), PLANT + len(PARAMETER_ORDER) + 28)  # fmt: skip
+    DEVIATION, STOPPING, MISSES, MISSED_IN_A_ROW, MEAN_A, MEAN_DELTA, WIND_X, WIND_Y, GUST,
+    WANDER_X, WANDER_Y, OUTAGE_END, NEXT_FIX, WAITING, DRIFT, FIX_X, FIX_Y, READ_SPEED,
+    READ_YAW_RATE, READ_HEADING,
+) = range(PLANT + len(PARAMETER_ORDER), PLANT + len(PARAMETER_ORDER) + 29)  # fmt: skip
 """actuators as they report (a, delta), last accepted command, places in the queue of commands, when
 the controller is free again (s), latency and occupation of the next computation if somebody
 measured them (s, else -1), standard deviation of the position (m), whether the vehicle brakes to a
-stop, deadline misses, mean reported inputs over the last period, the wind's direction and gust,
-GNSS, the readings of this period;"""
-ESTIMATE = PLANT + len(PARAMETER_ORDER) + 28
+stop, deadline misses in all and in a row, mean reported inputs over the last period, the wind's
+direction and gust, GNSS, the readings of this period;"""
+ESTIMATE = PLANT + len(PARAMETER_ORDER) + 29
 """the estimate, a memory as `kernels` has it;"""
 TAIL = ESTIMATE + kernels.MEMORY_SIZE
 """commands on their way (landing time s, a, delta), fixes on theirs (arrival s, stamp, x, y), and

@@ -20,7 +20,7 @@ from lpv_track_env.real_sensors import (
     read_sensors,
     receive_satellites,
 )
-from lpv_track_env.real_vehicle import blow, command_age, move, send
+from lpv_track_env.real_vehicle import INSTANT, blow, command_age, move, send
 from trajectories.compilation import compiled, compiled_internal
 from trajectories.projection import SEARCH_WINDOW
 
@@ -43,17 +43,27 @@ def drive_real(
     queue, ways, filter_memory = m[real.TAIL : fixes], m[fixes:filtered], m[filtered:]
     now = memory[k.STEPS] * p[k.PERIOD]
     draw = PERIOD_DRAW + DRAWS * (int(memory[k.STEPS]) + 1)
-    a, delta, bits = k.actuate(
-        a, delta, m[real.COMMAND_A], m[real.COMMAND_DELTA],
-        p[k.MAX_STEERING], p[k.STEERING_STEP], p[k.LOWEST_ACCELERATION], p[k.HIGHEST_ACCELERATION],
-        p[k.ACCELERATION_STEP],
-    )  # fmt: skip
-    send(m, queue, now, a, delta, offset_of(filter_memory, spec))
+    bits = 0
+    if m[real.FREE_AT] > now + INSTANT:
+        # The controller is still busy with an earlier command: it misses its turn.
+        m[real.MISSES] += 1.0
+        m[real.MISSED_IN_A_ROW] += 1.0
+    else:
+        # Rates are limited over the time since the last command.
+        periods = 1.0 + m[real.MISSED_IN_A_ROW]
+        a, delta, bits = k.actuate(
+            a, delta, m[real.COMMAND_A], m[real.COMMAND_DELTA], p[k.MAX_STEERING],
+            periods * p[k.STEERING_STEP], p[k.LOWEST_ACCELERATION], p[k.HIGHEST_ACCELERATION],
+            periods * p[k.ACCELERATION_STEP],
+        )  # fmt: skip
+        m[real.MISSED_IN_A_ROW] = 0.0
+        send(m, queue, now, a, delta, offset_of(filter_memory, spec))
+    m[real.LATENCY] = m[real.OCCUPIED] = -1.0
     blind = (
         spec[real.ESTIMATOR] == real.EKF
         and filter_memory[filtering.FIX_AGE] > spec[real.MAX_FIX_AGE]
     )
-    stale = command_age(m, queue, now) > spec[real.MAX_COMMAND_AGE] + 1e-9
+    stale = command_age(m, queue, now) > spec[real.MAX_COMMAND_AGE] + INSTANT
     m[real.STOPPING] = 1.0 if blind or stale else 0.0
     blow(m, key, episode, draw, p[k.PERIOD])
     vx, vy, psi, r, x, y = move(m, queue, memory, p, now)

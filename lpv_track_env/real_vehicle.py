@@ -20,25 +20,20 @@ AIR_DENSITY = 1.225
 """kg/m^3, standard atmosphere at sea level."""
 GUST_DRAW = 32
 """Place of the gust's draw among those of a control period, see `real_sensors`."""
+INSTANT = 1e-9
+"""s that are no time: rounding of sums of periods."""
 STOP_DECELERATION = 2.0
 """m/s^2 of the brakes when the vehicle stops by itself; `agents.base` stops likewise."""
 
 
 @compiled_internal
 def send(m: Array, queue: Array, now: Any, a: Any, delta: Any, offset: Any) -> None:
-    """Send a command computed from readings at `now`, its steering less an offset: it lands later.
-
-    A controller that is still busy with an earlier one misses its turn: the command is dropped.
-    """
+    """Send a command made from readings at `now`, its steering less an offset: it lands later."""
     latency, occupied = m[real.LATENCY], m[real.OCCUPIED]
     if latency < 0.0:
         latency = m[real.COMPUTING_DELAY]
     if occupied < 0.0:
         occupied = latency
-    m[real.LATENCY] = m[real.OCCUPIED] = -1.0
-    if m[real.FREE_AT] > now + 1e-9:
-        m[real.MISSES] += 1.0
-        return
     m[real.FREE_AT] = now + occupied
     m[real.COMMAND_A], m[real.COMMAND_DELTA] = a, delta
     landing = now + latency

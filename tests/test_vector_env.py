@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
 import trajectories
+from lpv_track_env.conditions import REALTIME
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.registration import PATH_TRACKING
 from lpv_track_env.vector_env import PathTrackingVectorEnv
@@ -100,6 +101,38 @@ def test_equals_gymnasiums_own(n: int, vehicle: str, mode: AutoresetMode) -> Non
     assert "left_corridor" in ends
     if n >= 17:
         assert "time_limit" in ends
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("estimator", ["ekf", "raw", "truth"])
+def test_equals_gymnasiums_own_under_conditions(estimator: str, mode: AutoresetMode) -> None:
+    """Two paths and two vehicles, drawn; estimates, brakes and misses are infos like others."""
+    conditions = REALTIME.replace(estimator=estimator, computing_delay=(0.01, 0.07))
+    settings = {**LIVELY, "conditions": conditions, "max_lateral_error": 1.5}
+    for vehicle in VEHICLES:
+        given = {**settings, "vehicle": vehicle}
+        ours, theirs = make(9, autoreset_mode=mode, **given), sync(9, mode, **given)
+        for one, other in zip(ours.reset(seed=5), theirs.reset(seed=5), strict=True):
+            assert_equal(one, other)
+        misses = 0
+        for action in actions(9, 60):
+            *_, infos = step_both(ours, theirs, action, mode)
+            misses = max(misses, infos["deadline_misses"].max())
+        assert misses > 0
+
+
+def test_threads_change_nothing_under_conditions() -> None:
+    settings = {
+        **LIVELY, "trajectory": ["T2", "T4"], "vehicle": list(VEHICLES), "conditions": "realtime",
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }  # fmt: skip
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("numba sees one processor")
+    one, two = make(70, **settings), make(70, threads=2, **settings)
+    assert_equal(one.reset(seed=3)[0], two.reset(seed=3)[0])
+    for action in actions(70, 40):
+        for ours, theirs in zip(one.step(action), two.step(action), strict=True):
+            assert_equal(ours, theirs)
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -10,7 +10,7 @@ SETTINGS = (
 """Options that are fields of `Setup` as they stand."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
+def add_parallel_options(parser: argparse.ArgumentParser) -> None:
     """Add them to the command's parser."""
     parser.add_argument("--trajectory", default="T2", metavar="NAME")
     parser.add_argument("--agent", default="lpv-nmpc", metavar="NAME", help="or file.py:Class")

@@ -152,10 +152,12 @@ class Supervisor:
         ms = 0
         while True:
             due = self._origin + ms * MS
-            while (left := due - time.monotonic_ns()) > 0:
-                message = self._commands.wait(1e-9 * left)
+            left = 1.0
+            while left > 0.0:
+                left = 1e-9 * (due - time.monotonic_ns())
+                message = self._commands.wait(max(left, 0.0))
                 if message is not None:
-                    self._apply(message)
+                    self._apply(message, ms)
             vehicle.advance(ms / MS_PER_SECOND)
             self._recording.lateness.append(1e-9 * (time.monotonic_ns() - due))
             self._recording.ages.append(vehicle.age)
@@ -170,9 +172,6 @@ class Supervisor:
                 self._keep_estimate()
                 self._look_for_the_dead()
                 self._look_for_the_hung()
-            # What came in a tick whose deadline was missed already.
-            if (message := self._commands.wait(0.0)) is not None:
-                self._apply(message)
             ms += setup.tick_ms
 
     def _end(self, ms: int) -> str:
@@ -185,11 +184,11 @@ class Supervisor:
             return "fault"
         return "seconds" if ms >= MS_PER_SECOND * self.setup.seconds else ""
 
-    def _apply(self, message: Message) -> None:
-        """Give the vehicle a command at the moment at which it came."""
+    def _apply(self, message: Message, tick_ms: int) -> None:
+        """Give the vehicle a command at the moment at which it came, by the next tick at most."""
         value = message.value
         now = time.monotonic_ns()
-        self._vehicle.advance(1e-9 * (now - self._origin))
+        self._vehicle.advance(min(1e-9 * (now - self._origin), tick_ms / MS_PER_SECOND))
         taken = int(value["taken"])
         accepted = self._vehicle.take(
             float(value["acceleration"]), float(value["steering_angle"]),

@@ -67,7 +67,7 @@ class Vehicle:
         )  # fmt: skip
         self.env.reset(seed=setup.seed)
         # A first step has code loaded or compiled, for which there is no time while driving.
-        self.env.step(self.env.action_space.sample())
+        self.env.step([0.0, 0.0])  # type: ignore[arg-type]
         _, self.info = self.env.reset(seed=setup.seed)
         self._steps = 0
         self._stale_after = STALE_PERIODS * setup.period

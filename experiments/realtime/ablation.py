@@ -1,0 +1,187 @@
+"""`lpv-track ablation`: each disturbance alone and its cost, and what helps against all of them."""
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from experiments.benchmark import run_benchmark, selected
+from experiments.figures import COLOURS
+from experiments.results import revision, versions
+from experiments.suites import grid
+from experiments.tables import Estimate, estimate
+from lpv_track_env.conditions import REALTIME
+from trajectories.atomic import write_atomically
+
+Spec = dict[str, Any]
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "fixes: noise, wander, latency": ("gnss_noise", "gnss_wander", "gnss_latency"),
+    "fixes: outages": ("gnss_dropout_rate", "gnss_dropout_duration"),
+    "fixes: outliers": ("gnss_outlier_rate",),
+    "heading: noise, bias": ("heading_noise", "heading_bias"),
+    "yaw rate: noise, bias, drift": ("yaw_rate_noise", "yaw_rate_bias", "yaw_rate_drift"),
+    "speed: noise, scale": ("speed_noise", "speed_scale"),
+    "steering: lag": ("steering_lag",),
+    "steering: dead time": ("steering_dead_time",),
+    "steering: offset": ("steering_offset",),
+    "drive: lag, dead time": ("drive_lag", "drive_dead_time"),
+    "mass, inertia": ("mass_factor", "inertia_factor"),
+    "tyre stiffness": ("front_stiffness_factor", "rear_stiffness_factor"),
+    "rolling resistance": ("rolling_factor",),
+    "friction": ("friction",),
+    "wind, gusts": ("wind_speed", "gust_speed"),
+    "computing delay": ("computing_delay",),
+}
+"""What is switched on together, by the fields of `Conditions`, at the values of `REALTIME`."""
+
+IDEAL = "none"
+ALL = "all: realtime"
+WITHOUT_FILTER: dict[str, dict[str, Any]] = {
+    "all, readings without the filter": {"estimator": "raw"},
+    "all, perfect sensors": {"estimator": "truth"},
+    "all, steering offset not taken off": {"calibrate_steering": False},
+}
+"""All of `REALTIME` with other eyes."""
+
+
+def variants() -> dict[str, dict[str, Any]]:
+    """Conditions of each row, as cases have them."""
+    rows: dict[str, dict[str, Any]] = {IDEAL: {"name": "ideal", "estimator": "ekf"}}
+    for label, names in GROUPS.items():
+        changes = {name: getattr(REALTIME, name) for name in names}
+        rows[label] = {**rows[IDEAL], **changes}
+    rows[ALL] = {"name": "realtime"}
+    for label, changes in WITHOUT_FILTER.items():
+        rows[label] = {"name": "realtime", **changes}
+    return rows
+
+
+def specs_of(
+    trajectories: Sequence[str], seeds: Sequence[int], agent: str
+) -> dict[tuple[str, bool], list[Spec]]:
+    """Cases by row and by whether delays are compensated."""
+    cells = {}
+    for label, conditions in variants().items():
+        for compensated in (True, False):
+            settings = {"delay_compensation": compensated}
+            cells[label, compensated] = grid(
+                (agent,), trajectories, seeds=seeds, conditions=conditions, agent_settings=settings
+            )
+    return cells
+
+
+def ablate(
+    folder: Path,
+    *,
+    trajectories: Sequence[str],
+    seeds: Sequence[int],
+    agent: str,
+    workers: int,
+    console: Console,
+) -> int:
+    """Drive all rows, print the table, write `ablation.json` and `ablation.png`.
+
+    Cases that the folder holds already are kept, so an interrupted run goes on.
+    """
+    cells = specs_of(trajectories, seeds, agent)
+    specs = [spec for cell in cells.values() for spec in cell]
+    settings = {
+        "experiment": "ablation", "agent": agent, "trajectories": list(trajectories),
+        "seeds": list(seeds),
+    }  # fmt: skip
+    store = run_benchmark(specs, folder, workers=workers, settings=settings, console=console)
+    rows = [
+        {"row": label, "compensated": compensated, **summary(selected(store, cell))}
+        for (label, compensated), cell in cells.items()
+    ]
+    result = {**settings, "rows": rows, "revision": revision(), "versions": versions()}
+    write_atomically(folder / "ablation.json", json.dumps(result, indent=1).encode())
+    write_atomically(folder / "ablation.png", picture(result))
+    console.print(table(result))
+    console.print(
+        f"written: {folder / 'ablation.json'}, ablation.png",
+        markup=False, highlight=False, soft_wrap=True,
+    )  # fmt: skip
+    failed = [case for case in selected(store, specs) if case["status"] != "ok"]
+    for case in failed:
+        console.print(f"failed: {case['id']}: {case['error']}", markup=False, style="red")
+    return 1 if failed else 0
+
+
+def summary(cases: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What the episodes of a cell came to: means over them with 95 % intervals, ends."""
+    done = [case for case in cases if case["status"] == "ok"]
+    values: dict[str, Any] = {}
+    for key in ("mle", "ale", "rms_estimate_error", "steering_variation"):
+        found = estimate([case["metrics"][key] for case in done]) if done else Estimate(-1.0)
+        values[key], values[f"{key}_half_width"] = found.mean, found.half_width
+    finished = sum(case["end"] == "finished" for case in done)
+    return {**values, "episodes": len(cases), "finished": finished}
+
+
+def _cell(row: Mapping[str, Any], key: str) -> str:
+    if row["finished"] < row["episodes"]:
+        return f"left {row['episodes'] - row['finished']} of {row['episodes']}"
+    half = row[f"{key}_half_width"]
+    return f"{row[key]:.3f}" + (f" ±{half:.3f}" if half is not None else "")
+
+
+def table(result: Mapping[str, Any]) -> Table:
+    """Rows with and without compensation beside one another."""
+    paths = ", ".join(result["trajectories"])
+    shown = Table(
+        title=f"{result['agent']} on {paths}, {len(result['seeds'])} seeds: mean, 95 % interval",
+        title_justify="left",
+    )
+    shown.add_column("disturbance")
+    for heading in ("ALE m", "MLE m", "estimate rms m", "ALE m, not compensated", "MLE m"):
+        shown.add_column(heading, justify="right")
+    pairs: dict[str, dict[bool, Mapping[str, Any]]] = {}
+    for row in result["rows"]:
+        pairs.setdefault(row["row"], {})[row["compensated"]] = row
+    for label, pair in pairs.items():
+        with_it, without = pair[True], pair[False]
+        shown.add_row(
+            label, _cell(with_it, "ale"), _cell(with_it, "mle"),
+            f"{with_it['rms_estimate_error']:.3f}", _cell(without, "ale"), _cell(without, "mle"),
+            end_section=label in {IDEAL, list(GROUPS)[-1]},
+        )  # fmt: skip
+    return shown
+
+
+def picture(result: Mapping[str, Any]) -> bytes:
+    """PNG: ALE of every row, with and without compensation; hatched where the road was left."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    labels = list(dict.fromkeys(row["row"] for row in result["rows"]))
+    figure = Figure(figsize=(9.0, 0.42 * len(labels) + 1.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    ax = figure.subplots()
+    for offset, compensated, colour in ((-0.2, True, COLOURS[0]), (0.2, False, COLOURS[1])):
+        rows = {row["row"]: row for row in result["rows"] if row["compensated"] is compensated}
+        for place, label in enumerate(labels):
+            row = rows[label]
+            left = row["finished"] < row["episodes"]
+            ax.barh(
+                place + offset, row["ale"], 0.38, color=colour, alpha=0.35 if left else 1.0,
+                hatch="//" if left else None, edgecolor="white" if not left else colour,
+                xerr=None if left else (row["ale_half_width"] or 0.0), ecolor="0.3",
+                label=("delays compensated" if compensated else "not compensated")
+                if place == 0 else None,
+            )  # fmt: skip
+    ax.set_yticks(range(len(labels)), labels)
+    ax.invert_yaxis()
+    ax.set_xscale("log")
+    ax.set_xlabel("ALE, m (hatched: some episodes left the road, so it says little)")
+    ax.grid(visible=True, axis="x", alpha=0.3)
+    ax.legend(loc="lower right")
+    ax.set_title(f"{result['agent']}: each disturbance alone, and all of them")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()

@@ -1,0 +1,265 @@
+"""`lpv-track latency`: estimation and control in sequence or in parallel, what it does to a drive.
+
+kumar2025lpv runs both in parallel processes to cut latency and gives no figure (errata, 9). Here
+times of this project's filter and solvers are recorded, every period's are drawn from them, and
+they become delays of a vehicle in real-time conditions. What parallel processes change is how often
+a command can be made: a computation in sequence that takes longer than a period misses every
+second one. How old a command's readings are does not get better by it, with clocks of their own it
+gets worse.
+"""
+
+import io
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from experiments.benchmark import run_benchmark, selected
+from experiments.cases import Case
+from experiments.computing import ARRANGEMENTS, ComputingTimes, quantiles
+from experiments.figures import COLOURS
+from experiments.results import revision, versions
+from experiments.rollout import rollout
+from experiments.suites import grid
+from experiments.tables import estimate
+from lpv_track_env.estimator import Estimator
+from lpv_track_env.vehicle import VEHICLES
+from trajectories.atomic import write_atomically
+
+Spec = dict[str, Any]
+
+PERIOD = 0.02
+"""s: 50 Hz, the paper's."""
+ENV = {"preview_period": 0.05}
+AGENT = "lpv-nmpc"
+SOLVERS = ("lpv-nmpc", "lpv-nmpc-ipopt")
+MAILBOX = 1e-4
+"""s from process to process, as `lpv-track run-parallel --bench-mailbox` measures it."""
+SHARES = (0.5, 1.0, 1.5, 1.9)
+"""Mean computing time by the period, of slower computers; half of it the estimator's."""
+RECORDED_STEPS = 400
+
+
+def record(trajectory: str, steps: int = RECORDED_STEPS) -> dict[str, list[float]]:
+    """Measure the filter and the solvers here: quantiles of times, s, by name."""
+    recorded = {"ekf": quantiles(filter_times(steps))}
+    for name in SOLVERS:
+        case = Case(
+            agent=name, trajectory=trajectory, control_period=PERIOD, conditions="realtime",
+            env_settings={**ENV, "time_limit": steps * PERIOD},
+        )  # fmt: skip
+        env = case.make_env()
+        driven = rollout(env, case.make_agent(env), seed=0)
+        # Without the first solve, which starts cold.
+        recorded[name] = quantiles(driven.trace.solve_time[2:])
+        env.close()
+    return recorded
+
+
+def filter_times(steps: int) -> list[float]:
+    """Times of the filter's work in a period: prediction, readings, and a fix 0.1 s late, s."""
+    estimator = Estimator(VEHICLES["m2-minibus"], period=PERIOD)
+    times: list[float] = []
+    for _ in range(2):
+        # The second time everything is compiled.
+        times.clear()
+        estimator.begin(0.0, 0.0, 0.0, 0.0, 8.0)
+        for k in range(1, steps + 1):
+            now = k * PERIOD
+            began = time.perf_counter()
+            estimator.advance(now, 0.2, 0.01, heading=0.0, yaw_rate=0.0, speed=8.0)
+            if k % 5 == 0:
+                estimator.take_fix(now - 0.1, 8.0 * (now - 0.1), 0.0)
+            times.append(time.perf_counter() - began)
+    return times
+
+
+def loads(recorded: Mapping[str, Sequence[float]]) -> dict[str, dict[str, Any]]:
+    """Times of estimator and controller of each row, arguments of `ComputingTimes`."""
+    rows: dict[str, dict[str, Any]] = {
+        f"measured: ekf, {name}": {"estimation": recorded["ekf"], "control": recorded[name]}
+        for name in SOLVERS
+    }
+    ekf, ipopt = np.array(recorded["ekf"]), np.array(recorded["lpv-nmpc-ipopt"])
+    for share in SHARES:
+        half = 0.5 * share * PERIOD
+        rows[f"slower: {share:g} of a period"] = {
+            "estimation": (half / ekf.mean() * ekf).tolist(),
+            "control": (half / ipopt.mean() * ipopt).tolist(),
+        }
+    return rows
+
+
+def specs_of(
+    recorded: Mapping[str, Sequence[float]], trajectories: Sequence[str], seeds: Sequence[int]
+) -> dict[tuple[str, str], list[Spec]]:
+    """Cases by row and arrangement; the agent knows the mean latency of each."""
+    cells = {}
+    for label, times in loads(recorded).items():
+        for arrangement in ARRANGEMENTS:
+            computing = {"arrangement": arrangement, **times, "mailbox": MAILBOX}
+            probe = ComputingTimes(**computing, period=PERIOD)
+            mean = float(np.mean([probe(k, 0.0)[0] for k in range(2000)]))
+            cells[label, arrangement] = grid(
+                (AGENT,), trajectories, seeds=seeds, control_period=PERIOD, env_settings=ENV,
+                conditions={"name": "realtime", "computing_delay": mean}, computing=computing,
+            )  # fmt: skip
+    return cells
+
+
+def compare(
+    folder: Path,
+    *,
+    trajectories: Sequence[str],
+    seeds: Sequence[int],
+    times: Path | None,
+    workers: int,
+    console: Console,
+) -> int:
+    """Record times (or read them), drive all rows, print the table, write JSON and picture."""
+    kept = folder / "times.json"
+    recorded = read_times(times or kept) if times is not None or kept.exists() else None
+    if recorded is None:
+        console.print("recording the times of the filter and of both solvers ...")
+        recorded = record(trajectories[0])
+    write_atomically(kept, json.dumps(recorded).encode())
+    cells = specs_of(recorded, trajectories, seeds)
+    specs = [spec for cell in cells.values() for spec in cell]
+    settings = {
+        "experiment": "latency", "trajectories": list(trajectories), "seeds": list(seeds),
+        "period": PERIOD,
+    }  # fmt: skip
+    store = run_benchmark(specs, folder, workers=workers, settings=settings, console=console)
+    rows = [
+        {"row": label, "arrangement": arrangement, **summary(selected(store, cell))}
+        for (label, arrangement), cell in cells.items()
+    ]
+    result = {
+        **settings, "times": recorded, "rows": rows, "revision": revision(), "versions": versions(),
+    }  # fmt: skip
+    write_atomically(folder / "latency.json", json.dumps(result, indent=1).encode())
+    write_atomically(folder / "latency.png", picture(result))
+    console.print(table(result))
+    console.print(
+        f"written: {folder / 'latency.json'}, latency.png; the same again with --times {kept}",
+        markup=False, highlight=False, soft_wrap=True,
+    )  # fmt: skip
+    failed = [case for case in selected(store, specs) if case["status"] != "ok"]
+    for case in failed:
+        console.print(f"failed: {case['id']}: {case['error']}", markup=False, style="red")
+    return 1 if failed else 0
+
+
+def read_times(file: Path) -> dict[str, list[float]]:
+    """Recorded times as a run before has written them.
+
+    Raises
+    ------
+    ValueError
+        If the file holds something else.
+    """
+    try:
+        recorded: dict[str, list[float]] = json.loads(file.read_text(encoding="utf-8"))
+        for name in ("ekf", *SOLVERS):
+            ComputingTimes(ARRANGEMENTS[0], recorded[name], recorded[name], period=PERIOD)
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file} does not hold recorded times: {error}") from error
+    return recorded
+
+
+def summary(cases: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Latencies (s), share of missed periods, tracking, over the episodes of a cell."""
+    done = [case for case in cases if case["status"] == "ok"]
+    ale, mle = (estimate([case["metrics"][key] for case in done]) for key in ("ale", "mle"))
+    periods = [case["metrics"]["duration"] / PERIOD for case in done]
+    return {
+        "latency_median": float(np.mean([case["latency"]["median"] for case in done])),
+        "latency_p99": float(np.mean([case["latency"]["p99"] for case in done])),
+        "missed": float(
+            np.sum([case["metrics"]["deadline_misses"] for case in done]) / np.sum(periods)
+        ),
+        "ale": ale.mean,
+        "ale_half_width": ale.half_width,
+        "mle": mle.mean,
+        "mle_half_width": mle.half_width,
+        "episodes": len(cases),
+        "finished": sum(case["end"] == "finished" for case in done),
+    }
+
+
+def table(result: Mapping[str, Any]) -> Table:
+    """A line per row and arrangement."""
+    paths = ", ".join(result["trajectories"])
+    shown = Table(
+        title=f"{AGENT} at {1 / PERIOD:.0f} Hz on {paths}, {len(result['seeds'])} seeds",
+        title_justify="left",
+    )
+    shown.add_column("computing time")
+    shown.add_column("arrangement")
+    for heading in (
+        "latency ms", "p99 ms", "periods missed", "ALE m", "MLE m", "finished",
+    ):  # fmt: skip
+        shown.add_column(heading, justify="right")
+    seen = ""
+    for row in result["rows"]:
+        shown.add_row(
+            "" if row["row"] == seen else row["row"], row["arrangement"],
+            f"{1e3 * row['latency_median']:.2f}", f"{1e3 * row['latency_p99']:.2f}",
+            f"{100 * row['missed']:.1f} %",
+            *(
+                f"{row[key]:.3f}"
+                + (f" ±{half:.3f}" if (half := row[f"{key}_half_width"]) is not None else "")
+                for key in ("ale", "mle")
+            ),
+            f"{row['finished']} of {row['episodes']}",
+            end_section=row["arrangement"] == ARRANGEMENTS[-1],
+        )  # fmt: skip
+        seen = row["row"]
+    return shown
+
+
+def picture(result: Mapping[str, Any]) -> bytes:
+    """PNG: latency, missed periods and ALE of every row and arrangement."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    labels = list(dict.fromkeys(row["row"] for row in result["rows"]))
+    figure = Figure(figsize=(12.0, 4.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = (
+        ("latency_median", 1e3, "latency, median, ms (line to p99)"),
+        ("missed", 100.0, "periods missed, %"),
+        ("ale", 1.0, "ALE, m"),
+    )
+    for ax, (key, factor, title) in zip(figure.subplots(1, 3, sharey=True), panels, strict=True):
+        for place, arrangement in enumerate(ARRANGEMENTS):
+            rows = {r["row"]: r for r in result["rows"] if r["arrangement"] == arrangement}
+            values = np.array([factor * rows[label][key] for label in labels])
+            heights = np.arange(len(labels)) + 0.25 * (place - 1)
+            spread: Any = None
+            if key == "latency_median":
+                top = np.array([factor * rows[label]["latency_p99"] for label in labels])
+                spread = [np.zeros(len(labels)), np.maximum(top - values, 0.0)]
+            elif key == "ale":
+                spread = [rows[label]["ale_half_width"] or 0.0 for label in labels]
+            ax.barh(
+                heights, values, 0.23, xerr=spread, color=COLOURS[place], ecolor="0.3",
+                label=arrangement,
+            )  # fmt: skip
+        ax.set_title(title)
+        ax.grid(visible=True, axis="x", alpha=0.3)
+        ax.set_yticks(range(len(labels)), labels)
+    figure.axes[0].invert_yaxis()
+    figure.axes[1].legend(loc="lower right")
+    figure.suptitle(
+        "Estimation and control in one process (sequential) or two (triggered by the estimate, or "
+        "free-running)"
+    )
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()
