@@ -170,13 +170,12 @@ def start_hammering(mailbox: Mailbox) -> multiprocessing.process.BaseProcess:
     return process
 
 
-@pytest.mark.parametrize("slots", [2, 4])
-def test_no_torn_value_under_a_hammering_writer_and_none_after_its_death(slots: int) -> None:
-    mailbox = Mailbox(RECORD, slots=slots)
+def test_no_torn_value_under_a_hammering_writer_and_none_after_its_death() -> None:
+    mailbox = Mailbox(RECORD, slots=2)  # So that most looks have to be taken again.
     reader = mailbox.reader.open()
     process = start_hammering(mailbox)
     last, read = 0, 0
-    until = time.monotonic() + 0.7
+    until = time.monotonic() + 0.5
     while time.monotonic() < until:
         message = reader.latest() if read % 2 else reader.wait(1.0)
         assert message is not None
