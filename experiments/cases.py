@@ -21,13 +21,14 @@ from agents.registry import check_settings, source_file
 from experiments import metrics
 from experiments.computing import ComputingTimes
 from experiments.rollout import Rollout, rollout
-from lpv_track_env import conditions, vehicle
+from lpv_track_env import conditions, plants, vehicle
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.naming import choose
 from lpv_track_env.task import SPEED_MODES
+from lpv_track_env.vehicle import VehicleParameters
 from trajectories.compilation import source_digest
 
-VEHICLE_FIELDS = tuple(field.name for field in fields(vehicle.VehicleParameters))
+VEHICLE_FIELDS = tuple(field.name for field in fields(VehicleParameters))
 ENV_SETTINGS = tuple(
     parameter.name
     for parameter in inspect.signature(PathTrackingEnv).parameters.values()
@@ -85,7 +86,6 @@ class Case:
             Listing the known names and the nearest.
         """
         check_settings(self.agent, self.agent_settings)
-        vehicle.load(self.vehicle)
         trajectories.load(self.trajectory)
         choose("speed mode", self.speed_mode, SPEED_MODES)
         conditions.load(self.plain_conditions)
@@ -96,6 +96,15 @@ class Case:
             choose("environment setting", key, ENV_SETTINGS)
         for key in self.vehicle_changes:
             choose("vehicle field", key, VEHICLE_FIELDS)
+        plants.make(self.env_settings.get("plant", plants.BICYCLE), self.make_vehicle())
+
+    def make_vehicle(self) -> VehicleParameters:
+        """The case's vehicle, with what is changed of it."""
+        changes = {
+            key: tuple(value) if isinstance(value, list) else value
+            for key, value in self.vehicle_changes.items()
+        }
+        return vehicle.load(self.vehicle).replace(**changes)
 
     @property
     def plain_conditions(self) -> str | dict[str, Any]:
@@ -104,17 +113,10 @@ class Case:
 
     def make_env(self, **settings: Any) -> gymnasium.Env[Any, Any]:
         """The case's environment; `settings` are added to the case's own."""
-        car = vehicle.load(self.vehicle)
-        if self.vehicle_changes:
-            changes = {
-                key: tuple(value) if isinstance(value, list) else value
-                for key, value in self.vehicle_changes.items()
-            }
-            car = car.replace(**changes)
         return gymnasium.make(
             "lpv_track_env/PathTracking-v0",
             trajectory=self.trajectory,
-            vehicle=car,
+            vehicle=self.make_vehicle(),
             speed_mode=self.speed_mode,
             fixed_speed=self.fixed_speed,
             conditions=self.plain_conditions,

@@ -21,7 +21,7 @@ def _benchmark(add: Add) -> None:
     benchmark.add_argument(
         "--suite",
         default="paper",
-        help="paper (default), quick, realtime, converged, sideslip or frozen",
+        help="paper (default), quick, realtime, plants, converged, sideslip or frozen",
     )
     benchmark.add_argument(
         "--agents", nargs="+", metavar="NAME", help="default: all; your own: file.py:Class"

@@ -4,11 +4,18 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import agents
+from lpv_track_env import plants
 from trajectories import PUBLISHED
 
 Spec = dict[str, Any]
 
 SIX = tuple(PUBLISHED)
+PAPER_VEHICLES = ("m2-minibus", "course-car")
+"""Vehicles of `paper`; `lpv-track verify` and `speed` hold for these.
+
+CommonRoad's cars, whose tyres are four times as stiff for their mass, leave lpv-nmpc without a
+solution in some percent of such wild situations, though never on the six.
+"""
 RAW = tuple(f"{name}-raw" for name in SIX)
 RAW_PREVIEW = {"preview_steps": 30, "preview_period": 0.1}
 LEAST_SEEDS = 10
@@ -61,7 +68,7 @@ def paper(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
         *grid(agent_names, SIX, seeds=seeds),
         *grid(fast, RAW, seeds=seeds, env_settings=RAW_PREVIEW),
         *grid(fast, SIX, speed_modes=("fixed",), seeds=seeds),
-        *grid(fast, SIX, vehicles=("course-car",), seeds=seeds),
+        *grid(fast, SIX, vehicles=PAPER_VEHICLES[1:], seeds=seeds),
         *realtime(fast, seeds),
     ]
     # The slow ones first, over all settings, so that no worker ends alone with one of them.
@@ -105,6 +112,17 @@ def frozen(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:  # n
     ]
 
 
+def independent(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:  # noqa: ARG001
+    """The NMPC on cars that nobody here modelled, beside its own model of them; needs `plants`."""
+    return [
+        spec
+        for plant in plants.names()
+        for spec in grid(
+            ("lpv-nmpc",), SIX, vehicles=("bmw-320i",), seeds=seeds, env_settings={"plant": plant}
+        )
+    ]
+
+
 def _by_speed(agent_names: Sequence[str]) -> tuple[list[str], list[str]]:
     """Agents that solve to convergence at every step, and all others."""
     solved = [name for name in agent_names if name == "lpv-nmpc-ipopt"]
@@ -118,6 +136,7 @@ SUITES = {
     "realtime": realtime,
     "converged": converged,
     "frozen": frozen,
+    "plants": independent,
 }
 
 

@@ -17,6 +17,7 @@ _SUBMODULES = (
     "kernels",
     "lpv",
     "observation",
+    "plants",
     "rendering",
     "reward",
     "task",

@@ -11,13 +11,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lpv_track_env import episodes, kernels, real, real_env, real_vehicle, vehicle
+from lpv_track_env import episodes, kernels, plants, real, real_env, real_vehicle, vehicle
 from lpv_track_env.conditions import LONGEST_DELAY, Actuation, Conditions
 from lpv_track_env.conditions import load as load_conditions
 from lpv_track_env.draws import random_key
 from lpv_track_env.episodes import given_start
 from lpv_track_env.naming import choose
 from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.plants.episode import PlantEpisode
 from lpv_track_env.real import RealArrays
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.task import Task, action_space, checked_period, reference
@@ -127,6 +128,11 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         Half width of the corridor, m.
     time_limit
         s; by default one and a half times the path's duration plus 10 s.
+    plant
+        What moves under the commands: "bicycle", or a vehicle that this project did not model
+        (`lpv_track_env.plants`): "single-track", "drift", "multi-body", for the vehicles
+        `ford-escort`, `bmw-320i`, `vw-vanagon`; or a function of `VehicleParameters` that makes a
+        `Plant`. A step with these costs 20 to 200 times as much, more below 2 m/s.
 
     ## Version history
 
@@ -156,6 +162,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         time_limit: float | None = None,
         initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
         random_start: bool = False,
+        plant: str | plants.Factory = plants.BICYCLE,
     ) -> None:
         if render_mode is not None:
             choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
@@ -163,6 +170,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._speed = (speed_mode, fixed_speed)
         car = _load_vehicle(vehicle)
         period = checked_period(control_period)
+        self.plant = plant
         self.base_task = Task(
             path=reference(trajectory, car, speed_mode, fixed_speed),
             vehicle=car,
@@ -189,7 +197,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._real: RealArrays | None = None
         self._renderer: Renderer | None = None
         self._open_views()
-        self._use(self.base_task)
+        self._use(self.base_task, self._plant_of(self.base_task))
 
     def _open_views(self) -> None:
         """Parts of the episode's array: to make a view costs as much as a copy."""
@@ -201,13 +209,24 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         # Python numbers pass through a memoryview in half the time.
         self._command: Any = data.data
 
-    def _use(self, task: Task) -> None:
+    def _use(self, task: Task, plant: PlantEpisode | None) -> None:
         if getattr(self, "task", None) is task:
             return
-        self.task = task
+        self.task, self._plant = task, plant
         self._constants[:] = task.constants()
         self._real = RealArrays.of(task)
         self._take_table(task.path.table)
+
+    def _plant_of(self, task: Task) -> PlantEpisode | None:
+        if getattr(self, "task", None) is task:
+            return self._plant
+        plant = plants.make(self.plant, task.vehicle)
+        if plant is not None and task.conditions is not None:
+            raise ValueError(
+                "plants other than 'bicycle' drive under conditions 'simulation' only, not "
+                f"{task.conditions.name!r}"
+            )
+        return None if plant is None else PlantEpisode(plant)
 
     def _take_table(self, table: NDArray[np.float64]) -> None:
         self._table = table
@@ -218,8 +237,12 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _first_advance(self, *arguments: NDArray[Any]) -> Any:
         """Have the kernel compiled where it is needed, in a first step, and go there."""
-        kernel = kernels.advance if self._real is None else real_env.advance_real
-        self._advance = entry_point(kernel, *arguments)
+        if self._plant is not None:
+            self._advance = self._plant.advance
+        elif self._real is not None:
+            self._advance = entry_point(real_env.advance_real, *arguments)
+        else:
+            self._advance = entry_point(kernels.advance, *arguments)
         return self._advance(*arguments)
 
     @property
@@ -302,15 +325,18 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             choose("reset option", key, RESET_OPTIONS)
         task = self.episode_task(options)
         given = given_start(options, task.path.length)
+        plant = self._plant_of(task)
         # All is checked: from here on the last episode is gone.
         super().reset(seed=seed)
         self._count_episode(reseeded=seed is not None)
-        self._use(task)
+        self._use(task, plant)
         if self._real is None:
             episodes.begin(
                 self._memory, self._constants, self._table, self._observation,
                 self._key, self._episode, given,
             )  # fmt: skip
+            if plant is not None:
+                plant.begin(self._memory)
         else:
             self._draws[:] = self._key, self._episode
             real_env.begin_real(

@@ -267,6 +267,31 @@ def advance(
 
 
 @compiled
+def command(episode: Array) -> tuple[Any, Any, int]:
+    """Actuators' values for the command in `episode`, and the bits of what they clipped."""
+    m, p = episode[MEMORY:CONSTANTS], episode[CONSTANTS:OBSERVATION]
+    a, delta, bits = actuate(
+        episode[0], episode[1], m[ACCELERATION], m[STEERING],
+        p[MAX_STEERING], p[STEERING_STEP], p[LOWEST_ACCELERATION], p[HIGHEST_ACCELERATION],
+        p[ACCELERATION_STEP],
+    )  # fmt: skip
+    return a, delta, bits
+
+
+@compiled
+def conclude(
+    episode: Array, table: Array,
+    vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, a: Any, delta: Any, bits: int,
+) -> int:  # fmt: skip
+    """End a control period whose new state another plant has come to; returns the end's code."""
+    end: int = finish(
+        episode[MEMORY:CONSTANTS], episode[CONSTANTS:OBSERVATION], table,
+        episode[OBSERVATION:].view(np.float32), vx, vy, psi, r, x, y, a, delta, bits,
+    )  # fmt: skip
+    return end
+
+
+@compiled
 def start(memory: Array, constants: Array, table: Array, observation: Array) -> None:
     """Begin an episode from the state and actuators that `memory` holds, near its ARC_LENGTH."""
     near = memory[ARC_LENGTH]

@@ -18,6 +18,7 @@ from lpv_track_env.draws import random_key
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.episodes import GIVEN, given_start
 from lpv_track_env.naming import choose
+from lpv_track_env.plants import BICYCLE
 from lpv_track_env.real_vector import RealVector
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task, action_space
@@ -93,7 +94,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
 
     ## Arguments
 
-    Those of `PathTrackingEnv` (rendering: "rgb_array" only, a frame an environment), and
+    Those of `PathTrackingEnv` (rendering: "rgb_array" only, a frame an environment; plant:
+    "bicycle" only), and
 
     num_envs
         n, number of environments.
@@ -132,11 +134,17 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         time_limit: float | None = None,
         initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
         random_start: bool = False,
+        plant: str = BICYCLE,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int = 1,
     ) -> None:
         if operator.index(num_envs) < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
+        if plant != BICYCLE:
+            raise ValueError(
+                f"the compiled vector environment drives plant={BICYCLE!r} only, not {plant!r}: "
+                "make_vec with vectorization_mode='sync' or 'async' takes every plant"
+            )
         if render_mode is not None:
             choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
         paths: list[str | Path | ReferencePath] = _listed("trajectory", trajectory)

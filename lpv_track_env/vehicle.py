@@ -183,8 +183,90 @@ M2_MINIBUS = VehicleParameters(
     width=2.0,
 )
 
+TYRE_STIFFNESS_PER_LOAD = 21.92
+"""1/rad, -p_ky1 of the tyre in CommonRoad's manual (Tab. 7), the slope of its Pacejka curve."""
+
+
+def _commonroad(
+    name: str,
+    car: str,
+    *,
+    mass: float,
+    yaw_inertia: float,
+    front_axle_distance: float,
+    rear_axle_distance: float,
+    max_steering_angle: float,
+    length: float,
+    width: float,
+) -> VehicleParameters:
+    """Vehicle of CommonRoad's manual, its tyres linearised at no slip and their static loads.
+
+    At small slip an axle's lateral force is C_S mu Fz = -p_ky1 Fz per rad, in the single-track
+    model (C_S = -p_ky1 / p_dy1, mu = p_dy1) and as the slope of the Pacejka curve alike; the loads
+    are Fzf = m g lr / L, Fzr = m g lf / L. So Caf lf = Car lr: these vehicles steer neutrally. The
+    models have no rolling resistance.
+    """
+    stiffness = TYRE_STIFFNESS_PER_LOAD * mass * GRAVITY
+    wheelbase = front_axle_distance + rear_axle_distance
+    return VehicleParameters(
+        name=name,
+        source=(
+            f"{car} of M. Althoff, G. Würsching, 'CommonRoad: Vehicle Models', 2020, Tab. 6 "
+            "(m, a, b, I_z, l, w, steering limits), as in commonroad-vehicle-models 3.0.2; "
+            "Caf, Car: its tyre's slope -p_ky1 (Tab. 7) at the axles' static loads"
+        ),
+        mass=mass,
+        yaw_inertia=yaw_inertia,
+        front_axle_distance=front_axle_distance,
+        rear_axle_distance=rear_axle_distance,
+        front_cornering_stiffness=stiffness * rear_axle_distance / wheelbase,
+        rear_cornering_stiffness=stiffness * front_axle_distance / wheelbase,
+        rolling_resistance=0.0,
+        max_steering_angle=max_steering_angle,
+        max_steering_rate=0.4,
+        length=length,
+        width=width,
+    )
+
+
+FORD_ESCORT = _commonroad(
+    "ford-escort",
+    "Ford Escort (vehicle 1)",
+    mass=1225.8878467253344,
+    yaw_inertia=1538.8533713561394,
+    front_axle_distance=0.88392,
+    rear_axle_distance=1.50876,
+    max_steering_angle=0.91,
+    length=4.298,
+    width=1.674,
+)
+
+BMW_320I = _commonroad(
+    "bmw-320i",
+    "BMW 320i (vehicle 2)",
+    mass=1093.2952334674046,
+    yaw_inertia=1791.5995300122856,
+    front_axle_distance=1.1561957064,
+    rear_axle_distance=1.4227170936,
+    max_steering_angle=1.066,
+    length=4.508,
+    width=1.61,
+)
+
+VW_VANAGON = _commonroad(
+    "vw-vanagon",
+    "VW Vanagon (vehicle 3)",
+    mass=1478.8979637767998,
+    yaw_inertia=2473.1176915564442,
+    front_axle_distance=1.1507916024,
+    rear_axle_distance=1.3211363976000001,
+    max_steering_angle=1.023,
+    length=4.569,
+    width=1.844,
+)
+
 VEHICLES: dict[str, VehicleParameters] = {
-    vehicle.name: vehicle for vehicle in (M2_MINIBUS, COURSE_CAR)
+    vehicle.name: vehicle for vehicle in (M2_MINIBUS, COURSE_CAR, FORD_ESCORT, BMW_320I, VW_VANAGON)
 }
 """Vehicle presets by name."""
 

@@ -10,13 +10,13 @@ from nmpc_situations import WEIGHTS
 from agents.nmpc.problem import Status
 from agents.weights import TrackingWeights
 from experiments.speed.wild import wild_observations
-from lpv_track_env.vehicle import VEHICLES
+from experiments.suites import PAPER_VEHICLES
 
 MAX_ITERATIONS = 44
 """Turns of both methods, with a last try to end in a guess."""
 
 
-@pytest.mark.parametrize("vehicle", VEHICLES)
+@pytest.mark.parametrize("vehicle", PAPER_VEHICLES)
 def test_wild_observations(vehicle: str) -> None:
     """24,000 in all. What cannot be solved says so, and every action can be driven."""
     env = environment(vehicle=vehicle)

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from trajectories import ReferencePath, SpeedLimits, load, plan_speed
@@ -158,6 +158,8 @@ def test_a_kink_slows_the_profile_down_but_never_stops_it() -> None:
     longitudinal=st.floats(0.5, 2.5),
     closed=st.booleans(),
 )
+# Its start is felt a whole lap away.
+@example(kappa=[0.0, 0.0, 0.0, 0.0625], top=11.0, lateral=2.0, longitudinal=2.0, closed=True)
 @settings(max_examples=25, deadline=None)
 def test_any_curvature_gets_a_profile_that_keeps_its_limits(
     kappa: list[float], top: float, lateral: float, longitudinal: float, closed: bool

@@ -313,8 +313,8 @@ def test_bad_reset_changes_nothing(
 
 
 def test_paths_and_vehicles_are_drawn_by_environment_and_episode() -> None:
-    names = ["T1", "circle", trajectories.load("sine")]
-    env = make(600, trajectory=names, vehicle=list(VEHICLES.values()), time_limit=0.1)
+    names, cars = ["T1", "circle", trajectories.load("sine")], [M2_MINIBUS, COURSE_CAR]
+    env = make(600, trajectory=names, vehicle=cars, time_limit=0.1)
     env.reset(seed=0)
     tasks = [env.task_of(i) for i in range(600)]
     drawn = [(task.path.name, task.vehicle.name) for task in tasks]
@@ -330,7 +330,7 @@ def test_paths_and_vehicles_are_drawn_by_environment_and_episode() -> None:
         env.step(action)
     again = [env.task_of(i).path.name for i in range(600)]
     assert again != [name for name, _ in drawn]
-    few = make(7, trajectory=names, vehicle=list(VEHICLES.values()), time_limit=0.1)
+    few = make(7, trajectory=names, vehicle=cars, time_limit=0.1)
     few.reset(seed=0)
     for action in actions(7, 3):
         few.step(action)

@@ -87,11 +87,12 @@ def test_understeer_gradient_is_that_of_the_field(
     # Finer by two orders of magnitude than what is asserted, and still coarser than rounding.
     (_, scaled), _, status, message = fsolve(unsteady, [0.0, 1.0], xtol=1e-9, full_output=True)
     assert status == 1, message
-    beyond_geometry = 1e-5 * scaled - car.wheelbase * curvature
-    assert beyond_geometry / (speed**2 * curvature) == pytest.approx(
-        car.understeer_gradient, rel=1e-6
+    geometry = car.wheelbase * curvature
+    assert 1e-5 * scaled - geometry == pytest.approx(
+        car.understeer_gradient * speed**2 * curvature, rel=1e-6, abs=1e-8 * geometry
     )
-    assert car.understeer_gradient > 0
+    # CommonRoad's cars are neutral, up to rounding; none oversteers.
+    assert car.understeer_gradient > -1e-15
 
 
 def test_gradient_of_a_neutral_vehicle_is_zero() -> None:

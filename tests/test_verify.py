@@ -15,6 +15,7 @@ from agents.nmpc.casadi_solver import CasadiSolver, discrete_model
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.weights import TrackingWeights
 from experiments.cli import main
+from experiments.suites import PAPER_VEHICLES
 from experiments.verify.bench import Bench, relative, scaled_error, situation_death
 from experiments.verify.command import SOLVER
 from experiments.verify.cost import PlanCost, plan_cost, rolled_out
@@ -22,7 +23,7 @@ from experiments.verify.derivatives import CasadiDerivatives
 from experiments.verify.qp import PiqpOracle
 from experiments.verify.situations import ERRORS, Sampler, Situation, kind
 from experiments.verify.verdict import ROWS, shortfalls, summarise
-from lpv_track_env.vehicle import M2_MINIBUS, VEHICLES
+from lpv_track_env.vehicle import M2_MINIBUS
 
 Array = NDArray[np.float64]
 STAND_INS = Path(__file__).with_name("stand_in_solver.py")
@@ -31,7 +32,7 @@ NO_COST = np.zeros(10)
 
 @pytest.fixture(scope="module")
 def samplers() -> dict[str, Sampler]:
-    return {name: Sampler(name) for name in VEHICLES}
+    return {name: Sampler(name) for name in PAPER_VEHICLES}
 
 
 def draws(samplers: dict[str, Sampler], count: int) -> list[tuple[NmpcProblem, Situation]]:
@@ -332,7 +333,7 @@ def test_a_right_solver_passes(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert content["settings"]["seed"] == 4
     assert content["versions"]["piqp"]
     assert {"revision", "hardware", "written"} <= set(content)
-    assert [case["vehicle"] for case in content["situations"]] == list(VEHICLES)
+    assert [case["vehicle"] for case in content["situations"]] == list(PAPER_VEHICLES)
     assert all(summary["compared"] for summary in content["summary"])
     printed = capsys.readouterr().out
     assert "PIQP" in printed

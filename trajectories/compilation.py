@@ -137,6 +137,14 @@ def compiled_parallel(function: Function) -> Function:
     return _compile(function, parallel=True, _nrt=True)
 
 
+def compiled_with_lists(*folders: Path) -> Callable[[Function], Function]:
+    """`compiled`, for what makes lists or arrays, as the models of other packages do.
+
+    `folders` hold further sources of what it calls: a change in them makes its cache stale, too.
+    """
+    return lambda function: _compile(function, *folders, _nrt=True)
+
+
 def entry_point(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
     """What a call of a compiled function with such arguments ends in, compiled if need be.
 
@@ -157,7 +165,7 @@ def _compile_internal(function: Function, **more: bool) -> Function:
     return dispatcher  # type: ignore[no-any-return]
 
 
-def _compile(function: Function, **more: bool | str) -> Function:
+def _compile(function: Function, *sources: Path, **more: bool | str) -> Function:
     # Without numba's runtime there are no references to count, which takes a tenth of the time to
     # compile; no memory can be had either, but views of arrays can.
     options: dict[str, Any] = {"error_model": "numpy", "fastmath": False, "_nrt": False, **more}
@@ -170,6 +178,6 @@ def _compile(function: Function, **more: bool | str) -> Function:
     own = _package(Path(function.__code__.co_filename).parent)
     index = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if index is not None and hasattr(index, "_source_stamp"):
-        folders = dict.fromkeys((here, here.parent / "lpv_track_env", own))
+        folders = dict.fromkeys((here, here.parent / "lpv_track_env", own, *sources))
         index._source_stamp = (index._source_stamp, source_digest(*folders))  # noqa: SLF001
     return dispatcher  # type: ignore[no-any-return]

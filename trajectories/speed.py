@@ -25,6 +25,9 @@ STEERING_MARGIN = 0.96
 """Share of the steering rate that is used."""
 JERK_MARGIN = 0.92
 """Share of the jerk that is used: where speed is low the grid overshoots by up to 8 %."""
+SEAM = 1e-6
+"""m/s by which the speeds at a lap's ends may differ: a jerk of some mm/s^3."""
+MORE_LAPS = 4
 CHATTER_WEIGHT = 2e-3
 """Weight of the L1 term on changes of acceleration; without it profiles chatter at the caps."""
 
@@ -112,10 +115,14 @@ def plan_speed(
         )
         before = max(int(np.ceil(run_up / lap)), 1)
         shares = np.broadcast_to(share, curvature.shape)
-        laps = np.append(np.tile(curvature[:-1], 2 * before + 1), curvature[-1])
-        shares = np.append(np.tile(shares[:-1], 2 * before + 1), shares[-1])
-        speed = plan_speed(laps, spacing, limits, share=shares)
-        speed = speed[before * n : (before + 1) * n + 1].copy()
+        # A stop is felt from further off where jerk is bound: then from more laps away.
+        for around in range(before, before + MORE_LAPS):
+            laps = np.append(np.tile(curvature[:-1], 2 * around + 1), curvature[-1])
+            shared = np.append(np.tile(shares[:-1], 2 * around + 1), shares[-1])
+            speed = plan_speed(laps, spacing, limits, share=shared)
+            speed = speed[around * n : (around + 1) * n + 1].copy()
+            if abs(speed[-1] - speed[0]) < SEAM:
+                break
         speed[-1] = speed[0]
         return speed
     caps = speed_caps(curvature, spacing, limits, share)

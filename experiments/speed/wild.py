@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 import agents
 from agents.nmpc.problem import Status
 from experiments.speed.measure import PREDICT, Effort, Section, Tick
+from experiments.suites import PAPER_VEHICLES
 from lpv_track_env.observation import SCALARS
 from lpv_track_env.registration import PATH_TRACKING
-from lpv_track_env.vehicle import VEHICLES
 
 TRIES = 3
 """Times that an observation is solved, of which the fastest counts: the others were disturbed."""
@@ -55,7 +55,7 @@ def wild(section: Section, effort: Effort, tick: Tick) -> None:
         "warm start; those that are not finite need no solve and are left out."
     )
     begin = np.array([True])
-    for vehicle in VEHICLES:
+    for vehicle in PAPER_VEHICLES:
         env: gymnasium.Env[Any, Any] = gymnasium.make(PATH_TRACKING, vehicle=vehicle)
         agent = agents.make("lpv-nmpc", env)
         rows = wild_observations(

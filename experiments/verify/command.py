@@ -20,10 +20,10 @@ from agents.registry import agent_class
 from experiments import engines
 from experiments.benchmark import progress_bar
 from experiments.results import hardware, revision, versions
+from experiments.suites import PAPER_VEHICLES
 from experiments.verify.bench import FATROP_EVERY, run_situation, situation_death
 from experiments.verify.situations import kind
 from experiments.verify.verdict import QUANTILES, number, shortfalls, summarise
-from lpv_track_env.vehicle import VEHICLES
 from trajectories.atomic import write_atomically
 
 SOLVER = "agents.nmpc.rti_solver:RtiSolver"
@@ -89,7 +89,7 @@ def spec(index: int, seed: int, solver: str) -> dict[str, Any]:
         "trajectory": trajectory,
         "vehicle": vehicle,
         "solver": solver,
-        "fatrop": index // len(VEHICLES) % FATROP_EVERY == 0,
+        "fatrop": index // len(PAPER_VEHICLES) % FATROP_EVERY == 0,
     }
 
 

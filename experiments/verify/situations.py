@@ -12,9 +12,8 @@ from agents.nmpc.agent import IpoptNmpc
 from agents.nmpc.casadi_solver import CasadiSolver
 from agents.reference import steady_turn
 from agents.weights import TrackingWeights
-from experiments.suites import SIX
+from experiments.suites import PAPER_VEHICLES, SIX
 from lpv_track_env.registration import PATH_TRACKING
-from lpv_track_env.vehicle import VEHICLES
 from trajectories import load
 
 Array = NDArray[np.float64]
@@ -51,8 +50,8 @@ class Situation:
 
 def kind(index: int) -> tuple[str, str]:
     """Trajectory and vehicle of a situation: all pairs in turn."""
-    vehicles = list(VEHICLES)
-    return SIX[index // len(vehicles) % len(SIX)], vehicles[index % len(vehicles)]
+    count = len(PAPER_VEHICLES)
+    return SIX[index // count % len(SIX)], PAPER_VEHICLES[index % count]
 
 
 class Sampler:
