@@ -80,6 +80,16 @@ class DrivingTask:
             ) from None
 
 
+def stopping_acceleration(vehicle: VehicleParameters, speed: float) -> float:
+    """Acceleration command (m/s^2) of a controlled stop from a speed (m/s), down to standstill."""
+    # Where the speed is unknown it rolls on: braking blindly would end in reverse.
+    speed = max(speed, 0.0) if math.isfinite(speed) else 0.0
+    # Half the jerk limit brings deceleration and speed to zero together.
+    return vehicle.rolling_deceleration - min(
+        STOP_DECELERATION, math.sqrt(vehicle.max_jerk * speed)
+    )
+
+
 class TrackingAgent(ABC, Generic[Memory]):
     """An agent made from `control`, which drives one vehicle on one observation.
 
@@ -110,12 +120,10 @@ class TrackingAgent(ABC, Generic[Memory]):
         The memory is left alone: one NaN in an integral would stay there for good.
         """
         speed, steering = float(observation.longitudinal_speed), float(observation.steering_angle)
-        vehicle = self.task.vehicle
-        # Where the speed is unknown it rolls on: braking blindly would end in reverse.
-        speed = max(speed, 0.0) if math.isfinite(speed) else 0.0
-        # Half the jerk limit brings deceleration and speed to zero together.
-        braking = min(STOP_DECELERATION, math.sqrt(vehicle.max_jerk * speed))
-        return vehicle.rolling_deceleration - braking, steering if math.isfinite(steering) else 0.0
+        return (
+            stopping_acceleration(self.task.vehicle, speed),
+            steering if math.isfinite(steering) else 0.0,
+        )
 
     @abstractmethod
     def new_memory(self) -> Memory:

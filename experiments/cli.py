@@ -190,6 +190,22 @@ def _bag(options: argparse.Namespace, console: Any) -> int:
     return run_bag(options, console)
 
 
+def _run_parallel(options: argparse.Namespace, console: Any) -> int:
+    from experiments.benchmark import parse_settings
+    from experiments.parallel import command
+    from experiments.parallel.options import SETTINGS
+    from experiments.parallel.setup import Setup
+
+    if options.bench_mailbox:
+        return command.bench(options.out, console)
+    setup = Setup(
+        **{name: getattr(options, name) for name in SETTINGS},
+        conditions=conditions_of(options),
+        agent_settings=parse_settings(options.agent_set),
+    )
+    return command.run_parallel(setup, options.out, console)
+
+
 RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "benchmark": _benchmark,
     "report": _report,
@@ -200,6 +216,7 @@ RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "latency": _realtime,
     "verify": _verify,
     "bag": _bag,
+    "run-parallel": _run_parallel,
 }
 """What runs each command."""
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments.bags.arguments import add_bag_parsers
+from experiments.parallel.options import add_parallel_options
 
 Add = Callable[[str, str, str], argparse.ArgumentParser]
 """Makes the parser of a command from its name, what it does, and an example."""
@@ -179,6 +180,16 @@ def _bag(add: Add) -> None:
     )
 
 
+def _run_parallel(add: Add) -> None:
+    add_parallel_options(
+        add(
+            "run-parallel",
+            "Drive in real time with estimator and controller as processes of their own.",
+            "lpv-track run-parallel --trajectory T2 --seconds 60 --rate 50",
+        )
+    )
+
+
 def parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     root = argparse.ArgumentParser(
@@ -208,6 +219,7 @@ def parser() -> argparse.ArgumentParser:
         _latency,
         _verify,
         _bag,
+        _run_parallel,
     ):
         declare(add)
     return root

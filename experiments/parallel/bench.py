@@ -1,0 +1,159 @@
+"""How long a value takes from one process to another, by ways of waiting for it."""
+
+import multiprocessing
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from experiments.parallel.mailbox import Mailbox, Message, Reader
+from experiments.parallel.messages import ESTIMATE
+from experiments.parallel.processes import READY, Child, Link, quiet
+
+VALUES = 1000
+"""Written for each way of waiting, not counting the first."""
+WARM_UP = 20
+PAUSE = 0.005
+"""s between values: the reader has gone to sleep by then."""
+NAP = 1e-4
+"""s that the polling reader sleeps between looks."""
+TIMEOUT = 1.0
+
+Wait = Callable[[Reader, Any], Message | None]
+
+
+def by_pipe(reader: Reader, condition: Any) -> Message | None:
+    """The mailbox's own way."""
+    del condition
+    return reader.wait(TIMEOUT)
+
+
+def by_polling(reader: Reader, condition: Any) -> Message | None:
+    """Look, sleep a little, look again."""
+    del condition
+    while (message := reader.wait(0.0)) is None:
+        time.sleep(NAP)
+    return message
+
+
+def by_spinning(reader: Reader, condition: Any) -> Message | None:
+    """Look all the time: the least that can be had, at the price of a core."""
+    del condition
+    while (message := reader.wait(0.0)) is None:
+        pass
+    return message
+
+
+def by_condition(reader: Reader, condition: Any) -> Message | None:
+    """`multiprocessing.Condition`, whose lock a killed process may keep for good."""
+    with condition:
+        while (message := reader.wait(0.0)) is None:
+            condition.wait(TIMEOUT)
+    return message
+
+
+WAYS: dict[str, Wait] = {
+    "mailbox (pipe)": by_pipe,
+    "multiprocessing.Condition": by_condition,
+    f"polling every {1e3 * NAP:g} ms": by_polling,
+    "spinning": by_spinning,
+}
+
+
+def read(
+    link: Link, reader: Reader, condition: Any, way: str, values: int, said: Connection
+) -> None:
+    """Take the values and send back how long each was on its way, s."""
+    wait = WAYS[way]
+    latencies: list[float] = []
+    reader.open()
+    link.say(READY)
+    quiet()
+    while reader.taken < values + WARM_UP:  # One that was not taken in time is skipped.
+        message = wait(reader, condition)
+        now = time.monotonic_ns()
+        if message is None:
+            raise TimeoutError(f"no value for {TIMEOUT:g} s")
+        if message.sequence > WARM_UP:
+            latencies.append(1e-9 * (now - message.stamp))
+    reader.close()
+    said.send_bytes(np.array(latencies).tobytes())
+
+
+def measure(way: str, values: int) -> NDArray[np.float64]:
+    """Latencies of one way, s, from the writer's stamp to the reader having the value.
+
+    A value that was not taken before the next is not among them.
+    """
+    context = multiprocessing.get_context("spawn")
+    mailbox = Mailbox(ESTIMATE)
+    condition = context.Condition()
+    heard, said = context.Pipe(duplex=False)
+    writer = mailbox.writer.open()
+    child = Child("reader", context, read, (mailbox.reader, condition, way, values, said))
+    said.close()
+    try:
+        while not child.heard(READY):
+            if child.dead:
+                raise RuntimeError(f"the reader {child.cause_of_death()}")
+            time.sleep(PAUSE)
+        mailbox.unlink()
+        record = np.zeros((), ESTIMATE)
+        for _ in range(values + WARM_UP):
+            time.sleep(PAUSE)
+            writer.put(record)
+            if WAYS[way] is by_condition:
+                with condition:
+                    condition.notify_all()
+        return np.frombuffer(heard.recv_bytes())
+    except EOFError:
+        child.process.join()
+        raise RuntimeError(f"the reader {child.cause_of_death()}") from None
+    finally:
+        child.end()
+        mailbox.close()
+
+
+def costs() -> dict[str, float]:
+    """Median time of a write and of a look within one process, s."""
+    mailbox = Mailbox(ESTIMATE)
+    writer, reader = mailbox.writer.open(), mailbox.reader.open()
+    record = np.zeros((), ESTIMATE)
+    found: dict[str, list[float]] = {"put": [], "latest": []}
+    for _ in range(5 * VALUES):
+        began = time.perf_counter()
+        writer.put(record)
+        between = time.perf_counter()
+        reader.latest()
+        found["put"].append(between - began)
+        found["latest"].append(time.perf_counter() - between)
+    mailbox.close()
+    return {name: float(np.median(times)) for name, times in found.items()}
+
+
+def bench_mailbox(console: Console) -> dict[str, Any]:
+    """Measure all ways in turn, print a table; returns the figures, s."""
+    rows = Table(box=box.SIMPLE_HEAD, title=f"wake latency, us, {VALUES} values {PAUSE:g} s apart")
+    for heading in ("", "median", "99 %", "max"):
+        rows.add_column(heading, justify="left" if not heading else "right")
+    found: dict[str, Any] = {}
+    for way in WAYS:
+        latencies = measure(way, VALUES)
+        figures = {
+            "median": float(np.median(latencies)),
+            "p99": float(np.percentile(latencies, 99)),
+            "max": float(latencies.max()),
+        }
+        found[way] = figures
+        rows.add_row(way, *(f"{1e6 * value:.1f}" for value in figures.values()))
+    console.print(rows)
+    found["cost"] = costs()
+    told = ", ".join(f"{name} {1e6 * value:.1f} us" for name, value in found["cost"].items())
+    console.print(f"median cost in one process: {told}", highlight=False)
+    return found

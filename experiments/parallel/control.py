@@ -1,0 +1,186 @@
+"""The controller's process: an estimate in, a command out; it brakes on what it cannot trust."""
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents import Agent
+from agents.base import stopping_acceleration
+from experiments.parallel.mailbox import Reader, Writer
+from experiments.parallel.messages import (
+    COMMAND,
+    DRIVING,
+    FAILED,
+    NO_FIX,
+    NOT_FINITE,
+    STALE_ESTIMATE,
+    STALE_PERIODS,
+)
+from experiments.parallel.processes import ATTACHED, READY, Link, quiet
+from experiments.parallel.setup import Setup
+from lpv_track_env.bicycle import VX, X, Y
+from lpv_track_env.observer import PathObserver
+from lpv_track_env.vehicle import VehicleParameters
+
+WARM_UP = 20
+"""Calls of `predict` before the clock starts."""
+FAR = 1.0
+"""m between two estimates, beyond which some were missed: less than the observer looks around."""
+MAX_FAILURES = 10
+"""Failed calls of `predict` in a row after which the process gives up."""
+
+
+def control(link: Link, setup: Setup, estimates: Reader, commands: Writer) -> None:
+    """Answer every estimate with a command until the supervisor stops it.
+
+    Raises
+    ------
+    RuntimeError
+        When the agent has failed ten times in a row; until then each failure is a command to brake.
+    """
+    with estimates, commands:
+        link.say(ATTACHED)
+        controller = prepared(setup)
+        link.say(READY)
+        quiet()
+        while not link.stopped():
+            message = estimates.wait(controller.patience(time.monotonic_ns()))
+            if message is not None:
+                controller.answer(message.value, message.stamp)
+                commands.put(controller.command)
+            elif controller.is_stale(time.monotonic_ns()):
+                controller.brake_on_stale()
+                commands.put(controller.command)
+
+
+def prepared(setup: Setup) -> "Controller":
+    """A controller whose agent has been asked some times, so that nothing is left to compile."""
+    env = setup.task_env()
+    agent = setup.make_agent(env)
+    observer = PathObserver(env.path, env.layout)
+    path = env.path
+    state = np.array([path.speed[0], 0.0, path.heading[0], 0.0, path.x[0], path.y[0]])
+    observer.begin(state, near=0.0)
+    for k in range(WARM_UP):
+        observation = observer.observe(state, env.vehicle.rolling_deceleration, 0.0)
+        agent.predict(observation, episode_start=np.array([k == 0]))
+    return Controller(agent, observer, env.vehicle, setup)
+
+
+class Controller:
+    """What is commanded, estimate by estimate.
+
+    Parameters
+    ----------
+    agent
+        Anything with `predict`.
+    observer
+        Makes its observations of estimates.
+    vehicle
+        That is stopped where there is nothing to drive on.
+    setup
+        The run's.
+    """
+
+    def __init__(
+        self, agent: Agent, observer: PathObserver, vehicle: VehicleParameters, setup: Setup
+    ) -> None:
+        self._agent, self._observer, self._vehicle = agent, observer, vehicle
+        self._period, self._max_fix_age = setup.period, setup.known_conditions.max_fix_age
+        self._stale_after = STALE_PERIODS * setup.period_ns
+        self._memory: Any = None
+        self._start = np.array([True])
+        self._in_a_row = 0
+        self._speed = 0.0
+        self._place = (math.inf, math.inf)
+        self.command: NDArray[Any] = np.zeros((), COMMAND)
+        """The last command; `taken` is 0 before there was one."""
+
+    def is_stale(self, now: int) -> bool:
+        """Whether the newest estimate is three control periods old at `now` (ns)."""
+        taken = int(self.command["taken"])
+        return taken > 0 and now - taken >= self._stale_after
+
+    def patience(self, now: int) -> float:
+        """How long to wait for an estimate, s: until the newest is stale, then a period."""
+        left = 1e-9 * (int(self.command["taken"]) + self._stale_after - now)
+        return min(left, self._period) if left > 0.0 else self._period
+
+    def answer(self, estimate: Any, estimated: int) -> None:
+        """Set the command that answers an ESTIMATE record, which was written at `estimated`."""
+        command = self.command
+        command["period"], command["taken"] = estimate["period"], estimate["taken"]
+        command["estimated"] = estimated
+        command["solve_time"] = 0.0
+        state, steering_angle = estimate["state"], float(estimate["steering_angle"])
+        self._speed = float(state[VX])
+        if not np.isfinite(state).all():
+            # Never to the observer, which goes on from where the vehicle was last.
+            self._speed = math.nan
+            self._brake(NOT_FINITE, steering_angle)
+            return
+        offset = float(estimate["steering_offset"])
+        # Also where nothing is driven, so as not to lose the place on the path.
+        self._follow(float(state[X]), float(state[Y]))
+        observation = self._observer.observe(
+            state, float(estimate["acceleration"]), steering_angle + offset
+        )
+        if self.is_stale(time.monotonic_ns()):
+            self._brake(STALE_ESTIMATE, steering_angle)
+        elif estimate["fix_age"] > self._max_fix_age:
+            self._brake(NO_FIX, steering_angle)
+        else:
+            self._drive(observation, steering_angle, offset)
+
+    def _follow(self, x: float, y: float) -> None:
+        """Find the place on the path again after estimates that were missed."""
+        moved = math.hypot(x - self._place[0], y - self._place[1])
+        if FAR < moved < math.inf:
+            near = self._observer.arc_length + moved
+            self._observer.begin([0.0, 0.0, 0.0, 0.0, x, y], near=near)
+        self._place = (x, y)
+
+    def _drive(
+        self, observation: NDArray[np.float32], steering_angle: float, offset: float
+    ) -> None:
+        command = self.command
+        began = time.perf_counter()
+        try:
+            action, self._memory = self._agent.predict(
+                observation, self._memory, episode_start=self._start
+            )
+            a, delta = map(float, action)
+            if not (math.isfinite(a) and math.isfinite(delta)):
+                raise ValueError(f"the action is not finite: {action}")
+        except Exception as error:
+            command["solve_time"] = time.perf_counter() - began
+            command["failures"] += 1
+            self._in_a_row += 1
+            if self._in_a_row >= MAX_FAILURES:
+                raise RuntimeError(
+                    f"predict failed {MAX_FAILURES} times in a row, "
+                    f"last with {type(error).__name__}: {error}"
+                ) from error
+            self._brake(FAILED, steering_angle)
+            return
+        command["solve_time"] = time.perf_counter() - began
+        command["reason"] = DRIVING
+        command["acceleration"], command["steering_angle"] = a, delta - offset
+        self._start = np.array([False])
+        self._in_a_row = 0
+
+    def brake_on_stale(self) -> None:
+        """Set a command to brake for lack of an estimate: steering as it was, slower and slower."""
+        if self.command["reason"] == STALE_ESTIMATE:
+            a = float(self.command["acceleration"]) - self._vehicle.rolling_deceleration
+            self._speed = max(self._speed + a * self._period, 0.0)
+        self.command["solve_time"] = 0.0
+        self._brake(STALE_ESTIMATE, float(self.command["steering_angle"]))
+
+    def _brake(self, reason: int, steering_angle: float) -> None:
+        self.command["reason"] = reason
+        self.command["acceleration"] = stopping_acceleration(self._vehicle, self._speed)
+        self.command["steering_angle"] = steering_angle

@@ -1,0 +1,277 @@
+"""A latest-value mailbox between processes: one writer, readers that never wait for it.
+
+The values lie in `multiprocessing.shared_memory`: a sequence number, and a few slots used in turn::
+
+    0    uint64   sequence number of the newest complete value, 0 before the first
+    64   slots    each [uint64 sequence, int64 stamp, uint64 checksum, value], in lines of 64 bytes
+
+Value n goes to slot n modulo their number; the sequence number at the front is written last, after
+which a byte into a pipe wakes the one reader that waits. There is no lock, so a writer that is
+killed at any instruction holds none: the front still names the last complete value, in another slot
+than the torn one.
+
+What a reader takes for whole does not depend on the order in which its processor sees these
+writes (x86 keeps it, ARM does not, and Python has no fence to ask for it): a copied slot counts
+only if it has the sequence number asked for and the CRC-32 over sequence, stamp and value fits.
+Otherwise the writer came round meanwhile, or its bytes are not all to be seen yet, and the reader
+looks again.
+
+The name in /dev/shm is needed only until every process has attached: `Mailbox.unlink` then takes it
+away, and the system frees the memory with the last process, however that ends. Until then
+multiprocessing's resource tracker stands by, of which children started by multiprocessing share
+their parent's (attaching registers there once more, which is without effect; a tracker of its own
+would remove the mailbox when such a child ends).
+"""
+
+import os
+import secrets
+import select
+import struct
+import time
+import zlib
+from multiprocessing.connection import Connection, Pipe
+from multiprocessing.shared_memory import SharedMemory
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+FRONT = 64
+LINE = 64
+CHECKED = struct.Struct("=Qq")
+CHECKSUM = struct.Struct("=Q")
+HEAD = struct.Struct("=QqQ")
+"""Sequence number and stamp, which are checked with the value, and their checksum."""
+ATTEMPTS = 10_000
+"""Copies that a reader makes of a value that is being overwritten, before it gives up."""
+
+
+class Message(NamedTuple):
+    """A complete value as it was written."""
+
+    sequence: int
+    """1 for the first value, then one more for each."""
+    stamp: int
+    """`time.monotonic_ns()` of the writer when it was written; one clock for all processes."""
+    value: Any
+    """A numpy record (np.void) of the mailbox's dtype, read-only."""
+
+
+class MailboxError(RuntimeError):
+    """A mailbox's memory does not hold what its sequence number says."""
+
+
+class Mailbox:
+    """The mailbox's memory and pipe, in the process that makes them and hands out the ends.
+
+    The ends are given to processes as arguments of `multiprocessing.Process` (spawn); each calls
+    `open` (or says `with`) where it is used and `close` where it is not. `unlink` comes once all
+    have opened theirs.
+
+    Parameters
+    ----------
+    dtype
+        Of a value: a numpy structured type without objects.
+    slots
+        How many values are kept: more than 2 make it rarer that a reader has to look again, and let
+        `Reader.wait_all` have those in between.
+
+    Raises
+    ------
+    ValueError
+        For a dtype with objects, or fewer than 2 slots.
+    """
+
+    def __init__(self, dtype: np.dtype[Any], *, slots: int = 4) -> None:
+        if dtype.hasobject:
+            raise ValueError(f"a mailbox cannot hold Python objects: {dtype}")
+        if slots < 2:
+            raise ValueError(f"a mailbox needs at least 2 slots, not {slots}")
+        self.dtype, self.slots = dtype, slots
+        # A name that tells whose it is, should anybody ever look.
+        name = f"lpv-track-{os.getpid()}-{secrets.token_hex(4)}"
+        self._memory = SharedMemory(name, create=True, size=FRONT + slots * _stride(dtype))
+        self._linked = True
+        waiting, waking = Pipe(duplex=False)
+        for connection in (waiting, waking):
+            os.set_blocking(connection.fileno(), False)
+        self.writer = Writer(name, dtype, slots, waking)
+        self.reader = Reader(name, dtype, slots, waiting)
+        """The one reader that can wait."""
+
+    def watcher(self) -> "Reader":
+        """A further reader, which can look but not wait."""
+        return Reader(self._memory.name, self.dtype, self.slots, None)
+
+    def unlink(self) -> None:
+        """Take the name away; nothing can be opened after that."""
+        if self._linked:
+            self._linked = False
+            self._memory.unlink()
+
+    def close(self) -> None:
+        """Close both ends as far as they are this process's, and unlink."""
+        self.writer.close()
+        self.reader.close()
+        self.unlink()
+        self._memory.close()
+
+
+class _End:
+    """What writer and reader share: the memory's views, made by `open`."""
+
+    def __init__(
+        self, name: str, dtype: np.dtype[Any], slots: int, connection: Connection | None
+    ) -> None:
+        self._name, self._dtype, self._slots = name, dtype, slots
+        self._connection = connection
+        self._stride = _stride(dtype)
+        self._memory: SharedMemory | None = None
+        self._buffer: Any = None
+        self._front: Any = None
+
+    def open(self) -> Self:
+        """Attach to the memory, in the process that is to use this end.
+
+        Raises
+        ------
+        FileNotFoundError
+            If the mailbox has been unlinked.
+        """
+        if self._memory is None:
+            self._memory = SharedMemory(self._name)
+            self._buffer = self._memory.buf
+            self._front = self._buffer[:8].cast("Q")
+        return self
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Detach and close this process's end of the pipe."""
+        if self._memory is not None:
+            self._front.release()
+            self._buffer = self._front = None
+            self._memory.close()
+            self._memory = None
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+
+class Writer(_End):
+    """The end that writes; there is one."""
+
+    def put(self, record: np.ndarray[Any, Any]) -> int:
+        """Write a value, an array () of the mailbox's dtype; returns its sequence number."""
+        value = record.tobytes()
+        sequence = self._front[0] + 1
+        checked = CHECKED.pack(sequence, time.monotonic_ns())
+        content = checked + CHECKSUM.pack(zlib.crc32(value, zlib.crc32(checked))) + value
+        offset = FRONT + sequence % self._slots * self._stride
+        self._buffer[offset : offset + len(content)] = content
+        self._front[0] = sequence
+        self._wake()
+        return int(sequence)
+
+    def _wake(self) -> None:
+        if self._connection is None:
+            return
+        try:
+            os.write(self._connection.fileno(), b"\0")
+        except BlockingIOError:
+            pass  # The pipe is full of wakes that the reader has not looked at.
+        except BrokenPipeError:  # Nobody waits any more.
+            self._connection.close()
+            self._connection = None
+
+
+class Reader(_End):
+    """An end that reads; values are given out once by `wait` and `wait_all`."""
+
+    def __init__(
+        self, name: str, dtype: np.dtype[Any], slots: int, connection: Connection | None
+    ) -> None:
+        super().__init__(name, dtype, slots, connection)
+        self.taken = 0
+        """Sequence number of the newest value that was given out."""
+        self.writer_gone = False
+        """Whether a wait has found that no process has the writing end open any more."""
+
+    def latest(self) -> Message | None:
+        """The newest complete value, given out before or not; None before the first.
+
+        Raises
+        ------
+        MailboxError
+            If no copy was whole in thousands of attempts.
+        """
+        for _ in range(ATTEMPTS):
+            sequence = self._front[0]
+            if sequence == 0:
+                return None
+            message = self._copy(sequence)
+            if message is not None:
+                return message
+        raise MailboxError("a mailbox's newest value is not whole: its memory was written over")
+
+    def wait(self, timeout: float) -> Message | None:
+        """The newest value that was not given out yet; None if none comes within `timeout` s."""
+        if not self._wait(timeout):
+            return None
+        message = self.latest()
+        assert message is not None
+        self.taken = message.sequence
+        return message
+
+    def wait_all(self, timeout: float) -> list[Message]:
+        """All values not given out yet that are still there, oldest first; [] after `timeout` s.
+
+        Sequence numbers tell what was lost in between.
+        """
+        if not self._wait(timeout):
+            return []
+        newest = int(self._front[0])
+        first = max(self.taken + 1, newest - self._slots + 1)
+        copies = [self._copy(sequence) for sequence in range(first, newest + 1)]
+        messages = [message for message in copies if message is not None]
+        if not messages:  # All were written over while they were copied.
+            message = self.latest()
+            assert message is not None
+            messages = [message]
+        self.taken = messages[-1].sequence
+        return messages
+
+    def _wait(self, timeout: float) -> bool:
+        """Whether there is a value that was not given out, after at most `timeout` s."""
+        deadline = time.monotonic() + timeout
+        while self._front[0] <= self.taken:
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                return False
+            if self._connection is None or self.writer_gone:
+                time.sleep(left)
+                continue
+            # Of poll, epoll and select only the last has a timeout finer than milliseconds.
+            ready, _, _ = select.select([self._connection], [], [], left)
+            if ready and not os.read(self._connection.fileno(), 4096):
+                self.writer_gone = True
+        return True
+
+    def _copy(self, sequence: int) -> Message | None:
+        """One value, if it is whole and still there."""
+        offset = FRONT + sequence % self._slots * self._stride
+        size = HEAD.size + self._dtype.itemsize
+        content = bytes(self._buffer[offset : offset + size])
+        found, stamp, checksum = HEAD.unpack_from(content)
+        value = content[HEAD.size :]
+        if found != sequence or checksum != zlib.crc32(value, zlib.crc32(content[: CHECKED.size])):
+            return None
+        return Message(found, stamp, np.frombuffer(value, self._dtype)[0])
+
+
+def _stride(dtype: np.dtype[Any]) -> int:
+    """Bytes from slot to slot: whole lines, so that two slots share none."""
+    return -(-(HEAD.size + dtype.itemsize) // LINE) * LINE

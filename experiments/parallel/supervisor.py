@@ -1,0 +1,262 @@
+"""The process that is the vehicle, in real time, and that watches over the other two."""
+
+import multiprocessing
+import signal
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from experiments.parallel.control import control
+from experiments.parallel.estimation import estimate
+from experiments.parallel.mailbox import Mailbox, Message, Reader
+from experiments.parallel.messages import COMMAND, ESTIMATE, SAMPLE, STALE_PERIODS
+from experiments.parallel.processes import (
+    ATTACHED,
+    READY,
+    Child,
+    Stop,
+    no_longer_quiet,
+    quiet,
+    wait_until,
+)
+from experiments.parallel.recording import Outcome, Recording
+from experiments.parallel.sensors import Sensors
+from experiments.parallel.setup import MS, MS_PER_SECOND, Setup
+from experiments.parallel.vehicle import Vehicle
+
+START_TIMEOUT = 180.0
+"""s until both processes must be ready: importing, and compiling where numba's cache is empty."""
+LEAD = 50 * MS
+"""ns from readiness to the first deadline."""
+SAMPLE_SLOTS = 64
+"""Samples that wait for an estimator that is late."""
+
+Say = Callable[[str], None]
+
+
+def run(setup: Setup, say: Say) -> Outcome:
+    """Drive one run; on return no process and no shared memory is left.
+
+    Parameters
+    ----------
+    setup
+        The run's.
+    say
+        Takes lines for the user.
+
+    Raises
+    ------
+    ValueError
+        Outside of the main thread, which alone is told of signals.
+    """
+    with Stop() as stop:
+        supervisor = Supervisor(setup, stop)
+        try:
+            supervisor.start(say)
+            return supervisor.drive()
+        finally:
+            supervisor.close()
+
+
+class Supervisor:
+    """Vehicle, mailboxes and child processes of one run."""
+
+    def __init__(self, setup: Setup, stop: Stop) -> None:
+        self.setup, self._stop = setup, stop
+        self._vehicle = Vehicle(setup)
+        self._sensors = Sensors(setup.known_conditions, setup.fix_ms, setup.seed)
+        self._recording = Recording()
+        self._children: list[Child] = []
+        self._mailboxes: list[Mailbox] = []
+        self._watchers: list[Reader] = []
+        self._fault = ""
+        self._origin = 0
+        self._sample = np.zeros((), SAMPLE)
+        self._handed_out: list[int] = []
+        """When the sample of each control period was handed out, ns."""
+        self._answered = -1
+        """Number of the last control period that a command answers."""
+
+    def start(self, say: Say) -> None:
+        """Start both processes and wait until they are ready; what fails is kept as the fault."""
+        context = multiprocessing.get_context("spawn")
+        for dtype, slots in ((SAMPLE, SAMPLE_SLOTS), (ESTIMATE, 4), (COMMAND, 4)):
+            self._mailboxes.append(Mailbox(dtype, slots=slots))
+        samples, estimates, commands = self._mailboxes
+        self._samples = samples.writer.open()
+        self._commands = commands.reader.open()
+        self._estimates = estimates.watcher().open()
+        self._watchers.append(self._estimates)
+        for name, role, ends in (
+            ("estimator", estimate, (samples.reader, estimates.writer)),
+            ("controller", control, (estimates.reader, commands.writer)),
+        ):
+            self._children.append(Child(name, context, role, (self.setup, *ends)))
+        # So that a reader sees when its writer is gone, and the other way round.
+        for end in (samples.reader, estimates.writer, estimates.reader, commands.writer):
+            end.close()
+        if self._all_say(ATTACHED):
+            for mailbox in self._mailboxes:
+                mailbox.unlink()
+        if self._all_say(READY):
+            names = [f"{child.name} {child.process.pid}" for child in self._children]
+            say(f"processes: {', '.join(names)}; the clock runs")
+
+    def _all_say(self, word: str) -> bool:
+        """Wait for a word from both children; False where a fault or a signal came first."""
+
+        def told_or_dead() -> bool:
+            return all(child.heard(word) for child in self._children) or any(
+                child.dead for child in self._children
+            )
+
+        if self._fault or self._stop.number:
+            return False
+        if not wait_until(told_or_dead, START_TIMEOUT, self._stop):
+            if not self._stop.number:
+                self._fault = f"the processes were not {word} after {START_TIMEOUT:g} s"
+            return False
+        self._look_for_the_dead()
+        return not self._fault
+
+    def drive(self) -> Outcome:
+        """Be the vehicle until time, path or a fault ends it; then stop it and the processes."""
+        end = ""
+        if not self._fault and not self._stop.number:
+            quiet()
+            try:
+                end = self._loop()
+            finally:
+                no_longer_quiet()
+        for child in self._children:
+            child.ask_to_stop()
+        stopped = self._vehicle.stop()
+        if self._stop.number:
+            end = signal.Signals(self._stop.number).name
+        return Outcome(
+            end=end or "fault",
+            fault=self._fault,
+            signal=self._stop.number,
+            recording=self._recording,
+            stale_brakings=self._vehicle.stale_brakings,
+            stop=stopped,
+            final_speed=self._vehicle.speed,
+            commands_refused=self._vehicle.commands_refused,
+        )
+
+    def _loop(self) -> str:
+        """One turn per tick: commands as they come, then what the vehicle's clock asks for."""
+        setup, vehicle = self.setup, self._vehicle
+        self._origin = time.monotonic_ns() + LEAD
+        ms = 0
+        while True:
+            due = self._origin + ms * MS
+            left = 1.0
+            while left > 0.0:
+                left = 1e-9 * (due - time.monotonic_ns())
+                message = self._commands.wait(max(left, 0.0))
+                if message is not None:
+                    self._apply(message, ms)
+            vehicle.advance(ms / MS_PER_SECOND)
+            self._recording.lateness.append(1e-9 * (time.monotonic_ns() - due))
+            self._recording.ages.append(vehicle.age)
+            begins = ms % setup.period_ms == 0
+            if begins:
+                self._recording.note(vehicle)
+                end = self._end(ms)
+                if end:
+                    return end
+            self._publish(ms, due)
+            if begins:
+                self._keep_estimate()
+                self._look_for_the_dead()
+                self._look_for_the_hung()
+            ms += setup.tick_ms
+
+    def _end(self, ms: int) -> str:
+        """Why the drive ends at the beginning of this period, or ""."""
+        if self._stop.number:
+            return "signal"
+        if self._vehicle.end is not None:
+            return self._vehicle.end
+        if self._fault and self._vehicle.braking is not None:
+            return "fault"
+        return "seconds" if ms >= MS_PER_SECOND * self.setup.seconds else ""
+
+    def _apply(self, message: Message, tick_ms: int) -> None:
+        """Give the vehicle a command at the moment at which it came, by the next tick at most."""
+        value = message.value
+        now = time.monotonic_ns()
+        self._vehicle.advance(min(1e-9 * (now - self._origin), tick_ms / MS_PER_SECOND))
+        taken = int(value["taken"])
+        accepted = self._vehicle.take(
+            float(value["acceleration"]), float(value["steering_angle"]),
+            1e-9 * (taken - self._origin),
+        )  # fmt: skip
+        if accepted:
+            self._answered = int(value["period"])
+            # It is in force from the vehicle's next cycle on.
+            applied = max(self._origin + round(1e9 * self._vehicle.time), now)
+            self._recording.commands.append(
+                (
+                    int(value["period"]), 1e-9 * (applied - taken),
+                    1e-9 * (int(value["estimated"]) - taken), 1e-9 * (message.stamp - taken),
+                    float(value["solve_time"]), int(value["reason"]), int(value["failures"]),
+                )
+            )  # fmt: skip
+
+    def _publish(self, ms: int, due: int) -> None:
+        sample, vehicle = self._sample, self._vehicle
+        sample["period"] = ms // self.setup.period_ms
+        sample["taken"], sample["time"] = due, ms / MS_PER_SECOND
+        sample["mean_acceleration"], sample["mean_steering_angle"] = vehicle.mean_inputs()
+        sample["acceleration"], sample["steering_angle"] = vehicle.in_force
+        state = vehicle.info["state"]
+        sample["truth"] = state
+        self._sensors.read(ms, state, sample)
+        self._samples.put(sample)
+        if ms % self.setup.period_ms == 0:
+            self._handed_out.append(time.monotonic_ns())
+
+    def _keep_estimate(self) -> None:
+        message = self._estimates.latest()
+        if message is not None:
+            self._recording.estimates[int(message.value["period"])] = message.value
+
+    def _look_for_the_dead(self) -> None:
+        for child in self._children:
+            if not self._fault and child.dead:
+                self._fault = f"the {child.name} {child.cause_of_death()}"
+
+    def _look_for_the_hung(self) -> None:
+        """Take a process for hung that has left samples unanswered for too long.
+
+        Time counts from when a sample was handed out, so a vehicle that is late itself blames
+        nobody.
+        """
+        if self._fault or self._vehicle.braking is None:
+            return
+        silence = self._silence(self._answered)
+        if silence < self.setup.watchdog * self.setup.period:
+            return
+        estimate = self._estimates.latest()
+        estimated = -1 if estimate is None else int(estimate.value["period"])
+        working = self._silence(estimated) < (STALE_PERIODS + 1) * self.setup.period
+        name, what = ("controller", "command") if working else ("estimator", "estimate")
+        self._fault = f"the {name} hangs: no {what} for {silence:.2f} s"
+
+    def _silence(self, answered: int) -> float:
+        """Time for which the first sample after period `answered` has been waiting, s."""
+        if answered + 1 >= len(self._handed_out):
+            return 0.0
+        return 1e-9 * (time.monotonic_ns() - self._handed_out[answered + 1])
+
+    def close(self) -> None:
+        """End both processes and remove the mailboxes, whatever state they are in."""
+        for child in self._children:
+            child.end()
+        for watcher in self._watchers:
+            watcher.close()
+        for mailbox in self._mailboxes:
+            mailbox.close()
