@@ -67,7 +67,11 @@ def take_command(m: Array, memory: Array, a: Any, delta: Any, spec: Array, const
         and filter_memory[filtering.FIX_AGE] > spec[real.MAX_FIX_AGE]
     )
     stale = command_age(m, queue, now) > spec[real.MAX_COMMAND_AGE] + INSTANT
-    m[real.STOPPING] = 1.0 if blind or stale else 0.0
+    m[real.STOPPING] = 0.0
+    if blind or stale:
+        m[real.STOPPING] = 1.0
+        # The drive goes on from where it is when commands count again: within the jerk limit.
+        m[real.COMMAND_A] = m[real.SERVO_A]
     return bits
 
 

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from experiments.benchmark import run_benchmark, selected
 from experiments.figures import COLOURS
+from experiments.realtime.axes import plain_ticks
 from experiments.results import revision, versions
 from experiments.suites import grid
 from experiments.tables import Estimate, estimate
@@ -138,9 +139,11 @@ def table(result: Mapping[str, Any]) -> Table:
         title=f"{result['agent']} on {paths}, {len(result['seeds'])} seeds: mean, 95 % interval",
         title_justify="left",
     )
-    shown.add_column("disturbance")
-    for heading in ("ALE m", "MLE m", "estimate rms m", "ALE m, not compensated", "MLE m"):
-        shown.add_column(heading, justify="right")
+    shown.add_column("disturbance", no_wrap=True)
+    for heading in (
+        "ALE\nm", "MLE\nm", "estimate\nrms m", "not comp.\nALE m", "not comp.\nMLE m",
+    ):  # fmt: skip
+        shown.add_column(heading, justify="right", no_wrap=True)
     pairs: dict[str, dict[bool, Mapping[str, Any]]] = {}
     for row in result["rows"]:
         pairs.setdefault(row["row"], {})[row["compensated"]] = row
@@ -178,9 +181,10 @@ def picture(result: Mapping[str, Any]) -> bytes:
     ax.set_yticks(range(len(labels)), labels)
     ax.invert_yaxis()
     ax.set_xscale("log")
+    plain_ticks(ax)
     ax.set_xlabel("ALE, m (hatched: some episodes left the road, so it says little)")
     ax.grid(visible=True, axis="x", alpha=0.3)
-    ax.legend(loc="lower right")
+    ax.legend(loc="upper right")
     ax.set_title(f"{result['agent']}: each disturbance alone, and all of them")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)

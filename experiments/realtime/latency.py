@@ -24,6 +24,7 @@ from experiments.benchmark import run_benchmark, selected
 from experiments.cases import Case
 from experiments.computing import ARRANGEMENTS, ComputingTimes, quantiles
 from experiments.figures import COLOURS
+from experiments.realtime.axes import plain_ticks
 from experiments.results import revision, versions
 from experiments.rollout import rollout
 from experiments.suites import grid
@@ -220,12 +221,12 @@ def table(result: Mapping[str, Any]) -> Table:
         title=f"{AGENT} at {1 / PERIOD:.0f} Hz on {paths}, {len(result['seeds'])} seeds",
         title_justify="left",
     )
-    shown.add_column("computing time")
-    shown.add_column("arrangement")
+    shown.add_column("computing time", max_width=24)
+    shown.add_column("arrangement", no_wrap=True)
     for heading in (
-        "clock ms", "latency ms", "p99 ms", "periods missed", "ALE m", "MLE m", "finished",
+        "clock\nms", "latency\nms", "p99\nms", "missed", "ALE\nm", "MLE\nm", "finished",
     ):  # fmt: skip
-        shown.add_column(heading, justify="right")
+        shown.add_column(heading, justify="right", no_wrap=True)
     seen = ""
     for row in result["rows"]:
         shown.add_row(
@@ -278,6 +279,7 @@ def picture(result: Mapping[str, Any]) -> bytes:
         ax.set_title(title)
         if key == "ale":
             ax.set_xscale("log")
+            plain_ticks(ax)
         ax.grid(visible=True, axis="x", alpha=0.3)
         ax.set_yticks(range(len(labels)), labels)
     figure.axes[0].invert_yaxis()
