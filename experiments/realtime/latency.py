@@ -283,7 +283,8 @@ def picture(result: Mapping[str, Any]) -> bytes:
         ax.grid(visible=True, axis="x", alpha=0.3)
         ax.set_yticks(range(len(labels)), labels)
     figure.axes[0].invert_yaxis()
-    figure.axes[1].legend(loc="upper right")
+    handles, names = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=len(names))
     figure.suptitle(
         "Estimation and control in one process (sequential) or two (triggered by the estimate, or "
         "free-running)"
