@@ -8,7 +8,7 @@ number with its reason in the table of `Conditions`.
 import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -95,7 +95,8 @@ class Conditions:
         heading, yaw rate and speed as read, and no lateral speed; "truth", perfect sensors,
         whatever noise they have.
     estimator_settings
-        What the filter believes (`lpv_track_env.estimator.EstimatorSettings`).
+        What the filter believes (`lpv_track_env.estimator.EstimatorSettings`); by default what its
+        maker would: the sensors' own figures, see `filter_settings`.
     calibrate_steering
         Whether the filter's estimate of the steering offset is taken off every command.
     max_fix_age
@@ -152,7 +153,7 @@ class Conditions:
     side_area: Range = 12.0
     computing_delay: Range = 0.0
     estimator: str = "ekf"
-    estimator_settings: EstimatorSettings = field(default_factory=EstimatorSettings)
+    estimator_settings: EstimatorSettings | None = None
     calibrate_steering: bool = True
     max_fix_age: float = 2.0
     max_command_age: float | None = None
@@ -188,6 +189,33 @@ class Conditions:
         """What is known beforehand of how commands become motion: the middles of the ranges."""
         return Actuation(*(self.middle(name) for name in Actuation._fields))
 
+    @property
+    def filter_settings(self) -> EstimatorSettings:
+        """The settings of the filter: those given, or of these sensors, at the ranges' middles.
+
+        Errors of fixes that last count as if they were noise, and so does the wheels' scale at a
+        usual speed. Biases are what their ranges may hold. No sensor is believed beyond a floor.
+        """
+        if self.estimator_settings is not None:
+            return self.estimator_settings
+
+        def most(name: str) -> float:
+            return max(map(abs, self.ends(name)))
+
+        return EstimatorSettings(
+            position_deviation=math.hypot(
+                self.middle("gnss_noise"), self.middle("gnss_wander"), 0.01
+            ),
+            heading_deviation=math.hypot(self.middle("heading_noise"), 0.001),
+            yaw_rate_deviation=math.hypot(self.middle("yaw_rate_noise"), 0.001),
+            speed_deviation=math.hypot(
+                self.middle("speed_noise"), most("speed_scale") * USUAL_SPEED, 0.01
+            ),
+            initial_gyro_bias=max(most("yaw_rate_bias"), 1e-4),
+            initial_heading_bias=max(most("heading_bias"), 1e-4),
+            initial_steering_offset=max(most("steering_offset"), 1e-4),
+        )
+
     def ranges(self) -> Array:
         """Both ends of every field that is drawn, shape (len(DRAWN), 2), in the order of DRAWN."""
         return np.array([self.ends(name) for name in DRAWN])
@@ -202,7 +230,7 @@ class Conditions:
                 yield item.name, value
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values for JSON, the filter's settings by name."""
+        """Plain values for JSON."""
         return dataclasses.asdict(self)
 
 
@@ -225,6 +253,8 @@ DELAYS = (
 )  # fmt: skip
 LONGEST_DELAY = 2.0
 """s; a bound of what memories are made for."""
+USUAL_SPEED = 8.0
+"""m/s at which the filter's settings reckon with the wheels' scale."""
 WIND_LEVER = 0.3
 """m from the centre of gravity forward to where the side wind acts: bluff fronts."""
 
@@ -320,10 +350,14 @@ def load(value: "str | Conditions | dict[str, object]") -> Conditions | None:
         for key in changes:
             choose("field of conditions", key, known)
         preset = PRESETS[choose("conditions", str(changes.pop("name", "ideal")), tuple(PRESETS))]
-        settings = changes.get("estimator_settings")
-        if isinstance(settings, dict):
-            for key in settings:
-                choose("estimator setting", key, tuple(EstimatorSettings.__dataclass_fields__))
-            changes["estimator_settings"] = EstimatorSettings(**settings)
-        return (preset or IDEAL).replace(**changes) if changes else preset
+        settings = changes.pop("estimator_settings", None)
+        for key in settings or {}:  # type: ignore[attr-defined]
+            choose("estimator setting", key, tuple(EstimatorSettings.__dataclass_fields__))
+        if not (changes or settings):
+            return preset
+        changed = (preset or IDEAL).replace(**changes)
+        if settings:
+            filtered = dataclasses.replace(changed.filter_settings, **settings)  # type: ignore[arg-type]
+            changed = changed.replace(estimator_settings=filtered)
+        return changed
     return PRESETS[choose("conditions", value, tuple(PRESETS))]

@@ -103,8 +103,8 @@ def spec_of(conditions: Conditions, vehicle: VehicleParameters, period: float) -
                 commands,
                 fixes,
             ],
-            conditions.estimator_settings.initial_variances,
-            conditions.estimator_settings.as_array(vehicle),
+            conditions.filter_settings.initial_variances,
+            conditions.filter_settings.as_array(vehicle),
         ]
     )
 

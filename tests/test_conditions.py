@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,19 @@ def test_presets() -> None:
     assert raw.steering_lag == REALTIME.steering_lag
     own = conditions.load({"estimator_settings": {"speed_noise": 0.2}})
     assert own is not None
-    assert own.estimator_settings == EstimatorSettings(speed_noise=0.2)
+    assert own.filter_settings == replace(IDEAL.filter_settings, speed_noise=0.2)
+
+
+def test_the_filter_knows_its_sensors() -> None:
+    poor = REALTIME.replace(gnss_noise=0.4, gnss_wander=0.3, heading_noise=(0.01, 0.03))
+    settings = poor.filter_settings
+    assert settings.position_deviation == pytest.approx(0.5, rel=1e-3)
+    assert settings.heading_deviation == pytest.approx(0.02, rel=2e-3)
+    assert settings.initial_steering_offset == 0.01
+    # Nothing is believed without bound.
+    assert min(IDEAL.filter_settings.initial_variances) > 0.0
+    given = EstimatorSettings(position_deviation=2.0)
+    assert poor.replace(estimator_settings=given).filter_settings is given
 
 
 def test_every_number_of_realtime_is_in_the_table() -> None:

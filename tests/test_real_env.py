@@ -289,9 +289,10 @@ def test_without_fixes_the_vehicle_stops_and_goes_on_when_they_return() -> None:
         ),
     )  # fmt: skip
     env.reset(seed=3)
-    stopping, deviations, speeds = [], [], []
+    stopping, deviations, speeds, accelerations = [], [], [], []
     for _ in range(200):
         info = act(env, HOLD + 0.1, 0.0)
+        accelerations.append(env.actuators[0])
         stopping.append(info["stopping"])
         deviations.append(info["position_deviation"])
         speeds.append(info["state"][VX])
@@ -307,7 +308,9 @@ def test_without_fixes_the_vehicle_stops_and_goes_on_when_they_return() -> None:
     assert stopping[begins : back + 1] == [True] * (back + 1 - begins)
     assert stopping[back + 1] is False
     assert speeds[back] < speeds[begins] - 0.3
-    assert speeds[back + 10] > speeds[back + 1]
+    assert speeds[back + 25] > speeds[back + 15]
+    # Into the stop and out of it within the jerk limit.
+    assert np.abs(np.diff(accelerations)).max() <= CAR.max_jerk * PERIOD + 1e-9
 
 
 def test_never_a_fix_is_a_full_stop() -> None:

@@ -47,7 +47,7 @@ def test_ablation(
     assert mpimg.imread(tmp_path / "ablation.png").std() > 0.05
     # What is there is not driven again.
     assert cli.main(command) == 0
-    assert "28 of 28 cases are in" in capsys.readouterr().out
+    assert "32 of 32 cases are in" in capsys.readouterr().out
 
 
 def test_latency(

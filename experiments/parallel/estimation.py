@@ -51,7 +51,7 @@ class Ekf:
         self._calibrate = setup.known_conditions.calibrate_steering
         self._estimator = Estimator(
             vehicle.load(setup.vehicle),
-            setup.known_conditions.estimator_settings,
+            setup.known_conditions.filter_settings,
             period=setup.tick_ms / MS_PER_SECOND,
         )
         self._begun = False

@@ -46,6 +46,7 @@ WITHOUT_FILTER: dict[str, dict[str, Any]] = {
     "all, readings without the filter": {"estimator": "raw"},
     "all, perfect sensors": {"estimator": "truth"},
     "all, steering offset not taken off": {"calibrate_steering": False},
+    "all, fixes ten times as bad": {"gnss_noise": 0.3, "gnss_wander": 0.3},
 }
 """All of `REALTIME` with other eyes."""
 

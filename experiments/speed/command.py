@@ -35,6 +35,7 @@ Measure = Callable[[Section, Effort, Tick], None]
 SECTIONS: dict[str, tuple[str, Measure]] = {
     "single": ("One environment through gymnasium.make", environments.single),
     "vector": ("Environments stepped together", environments.vector),
+    "conditions": ("The same under the conditions of a real vehicle", environments.conditions),
     "learning": ("Share of PPO's time that the environments take", learning.learning),
     "solvers": ("NMPC solvers on the same observations", solvers.solvers),
     "horizons": ("NMPC solvers over the horizon", solvers.horizons),

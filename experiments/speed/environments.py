@@ -107,6 +107,34 @@ def vector(section: Section, effort: Effort, tick: Tick) -> None:
         interleave(pairs.values(), effort.rounds)
 
 
+CONDITIONS: dict[str, Any] = {
+    "simulation": "simulation",
+    "realtime": "realtime",
+    "realtime, perfect sensors": {"name": "realtime", "estimator": "truth"},
+}
+
+
+def conditions(section: Section, effort: Effort, tick: Tick) -> None:
+    """The vector environment under the conditions of a real vehicle, over its number."""
+    section.notes.append(
+        "Seconds per env-step, as above, one thread. Real-time conditions have noise, lags, other "
+        "tyres and wind for every vehicle, and its own Kalman filter, fixes coming two periods "
+        "late; with perfect sensors there is no filter."
+    )
+    for n in effort.sizes[::2]:
+        pairs = []
+        for name, given in CONDITIONS.items():
+            tick(f"{n} environments: {name}")
+            series = section.add(name, "s/env-step", n=n, threads=1)
+            run = peers.stepping(make_vector(n, conditions=given), _actions(n))
+            once = calibrated(run, effort.round_seconds)
+            pairs.append((series, lambda once=once: once() / n))  # noqa: B023
+            if name != "simulation":
+                section.compare(pairs[0][0], series)
+        tick(f"{n} environments: rounds in turn")
+        interleave(pairs, effort.rounds)
+
+
 def _vector_runs(section: Section, n: int, threads: tuple[int, ...]) -> dict[tuple[str, int], Run]:
     factories: dict[tuple[str, int], Callable[[int], Run]] = {
         (OURS, count): partial(ours_vector, threads=count) for count in threads
