@@ -50,7 +50,6 @@ COMMAND, WAY = 3, 4
 """Numbers of a command and of a fix on its way."""
 
 # A spec holds the ranges of what is drawn, (COUNT, 2), then
-RANGES = 0
 GNSS_PERIOD = 2 * COUNT
 MAX_FIX_AGE, MAX_COMMAND_AGE, ESTIMATOR, CALIBRATE = (
     GNSS_PERIOD + 1, GNSS_PERIOD + 2, GNSS_PERIOD + 3, GNSS_PERIOD + 4,

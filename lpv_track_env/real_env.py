@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from lpv_track_env import filtering, real
 from lpv_track_env import kernels as k
-from lpv_track_env.draws import gaussian, uniform
 from lpv_track_env.episodes import begin
 from lpv_track_env.real_sensors import (
+    DRAWS,
+    PERIOD_DRAW,
     begin_estimate,
+    draw_conditions,
     estimate,
     offset_of,
     read_sensors,
@@ -33,10 +35,6 @@ from trajectories.compilation import compiled, compiled_internal
 from trajectories.projection import SEARCH_WINDOW
 
 Array = NDArray[Any]
-
-CONDITIONS_DRAW, DIRECTION_DRAW, WANDER_DRAW, GUST_DRAW, PHASE_DRAW = 16, 80, 82, 84, 86
-"""Places of an episode's draws, see `episodes`; from PERIOD_DRAW on, those of its periods."""
-PERIOD_DRAW, DRAWS = 128, 64
 
 
 @compiled_internal
@@ -139,11 +137,7 @@ def begin_real(
     begin(memory, constants, table, observation, key, episode, given)
     for j in range(m.shape[0]):
         m[j] = 0.0
-    for j in range(real.COUNT):
-        low, high = spec[2 * j], spec[2 * j + 1]
-        m[j] = low
-        if high > low:
-            m[j] += (high - low) * uniform(key, episode, CONDITIONS_DRAW + j)
+    draw_conditions(m, spec, key, episode)
     for j in range(7):
         m[real.PLANT + j] = constants[j]
     m[real.PLANT] *= m[real.MASS_FACTOR]
@@ -151,14 +145,6 @@ def begin_real(
     m[real.PLANT + 4] *= m[real.FRONT_STIFFNESS_FACTOR]
     m[real.PLANT + 5] *= m[real.REAR_STIFFNESS_FACTOR]
     m[real.PLANT + 6] *= m[real.ROLLING_FACTOR]
-    direction = 2.0 * math.pi * uniform(key, episode, DIRECTION_DRAW)
-    m[real.WIND_X], m[real.WIND_Y] = math.cos(direction), math.sin(direction)
-    first, second = gaussian(key, episode, WANDER_DRAW)
-    m[real.WANDER_X], m[real.WANDER_Y] = m[real.GNSS_WANDER] * first, m[real.GNSS_WANDER] * second
-    first, second = gaussian(key, episode, GUST_DRAW)
-    m[real.GUST] = m[real.GUST_SPEED] * first
-    # Receivers do not start with the drive.
-    m[real.NEXT_FIX] = spec[real.GNSS_PERIOD] * uniform(key, episode, PHASE_DRAW)
     m[real.LATENCY] = m[real.OCCUPIED] = -1.0
     m[real.SERVO_A], m[real.SERVO_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]
     m[real.COMMAND_A], m[real.COMMAND_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]

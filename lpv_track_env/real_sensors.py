@@ -13,8 +13,29 @@ from trajectories.compilation import compiled_internal
 
 Array = NDArray[Any]
 
-# Places of the draws within a control period's, see `real_env`.
+# Places of an episode's draws beside those of `episodes`;
+CONDITIONS_DRAW, DIRECTION_DRAW, FIRST_WANDER_DRAW, FIRST_GUST_DRAW, PHASE_DRAW = 16, 80, 82, 84, 86
+PERIOD_DRAW, DRAWS = 128, 64
+"""from PERIOD_DRAW on, DRAWS of them to a control period, and among these:"""
 READINGS_DRAW, FIX_DRAW, WANDER_DRAW, OUTAGE_DRAW, OUTLIER_DRAW, DRIFT_DRAW = 0, 4, 6, 8, 10, 12
+
+
+@compiled_internal
+def draw_conditions(m: Array, spec: Array, key: Any, episode: Any) -> None:
+    """Draw an episode's conditions, and what has been going on when it begins."""
+    for j in range(real.COUNT):
+        low, high = spec[2 * j], spec[2 * j + 1]
+        m[j] = low
+        if high > low:
+            m[j] += (high - low) * uniform(key, episode, CONDITIONS_DRAW + j)
+    direction = 2.0 * math.pi * uniform(key, episode, DIRECTION_DRAW)
+    m[real.WIND_X], m[real.WIND_Y] = math.cos(direction), math.sin(direction)
+    first, second = gaussian(key, episode, FIRST_WANDER_DRAW)
+    m[real.WANDER_X], m[real.WANDER_Y] = m[real.GNSS_WANDER] * first, m[real.GNSS_WANDER] * second
+    first, second = gaussian(key, episode, FIRST_GUST_DRAW)
+    m[real.GUST] = m[real.GUST_SPEED] * first
+    # Receivers do not start with the drive.
+    m[real.NEXT_FIX] = spec[real.GNSS_PERIOD] * uniform(key, episode, PHASE_DRAW)
 
 
 @compiled_internal
@@ -32,6 +53,31 @@ def read_sensors(m: Array, memory: Array, key: Any, episode: Any, draw: int, per
 
 
 @compiled_internal
+def measure_fix(
+    m: Array, x: Any, y: Any, spacing: Any, now: Any, key: Any, episode: Any, draw: int
+) -> tuple[bool, Any, Any]:
+    """Whether there is a fix of a position, `spacing` seconds after the last was due, and which."""
+    kept = math.exp(-spacing / m[real.GNSS_WANDER_TIME])
+    driven = m[real.GNSS_WANDER] * math.sqrt(1.0 - kept * kept)
+    first, second = gaussian(key, episode, draw + WANDER_DRAW)
+    m[real.WANDER_X] = kept * m[real.WANDER_X] + driven * first
+    m[real.WANDER_Y] = kept * m[real.WANDER_Y] + driven * second
+    if now < m[real.OUTAGE_END]:
+        return False, x, y
+    if uniform(key, episode, draw + OUTAGE_DRAW) < m[real.GNSS_DROPOUT_RATE] * spacing:
+        m[real.OUTAGE_END] = now + m[real.GNSS_DROPOUT_DURATION]
+        return False, x, y
+    first, second = gaussian(key, episode, draw + FIX_DRAW)
+    x += m[real.WANDER_X] + m[real.GNSS_NOISE] * first
+    y += m[real.WANDER_Y] + m[real.GNSS_NOISE] * second
+    if uniform(key, episode, draw + OUTLIER_DRAW) < m[real.GNSS_OUTLIER_RATE]:
+        angle = 2.0 * math.pi * uniform(key, episode, draw + OUTLIER_DRAW + 1)
+        x += m[real.GNSS_OUTLIER_SIZE] * math.cos(angle)
+        y += m[real.GNSS_OUTLIER_SIZE] * math.sin(angle)
+    return True, x, y
+
+
+@compiled_internal
 def receive_satellites(
     m: Array, ways: Array, memory: Array, now: Any, key: Any, episode: Any, draw: int, spec: Array
 ) -> None:
@@ -40,25 +86,9 @@ def receive_satellites(
         return
     spacing = spec[real.GNSS_PERIOD]
     m[real.NEXT_FIX] = max(m[real.NEXT_FIX] + spacing, now + 1e-6)
-    kept = math.exp(-spacing / m[real.GNSS_WANDER_TIME])
-    driven = m[real.GNSS_WANDER] * math.sqrt(1.0 - kept * kept)
-    first, second = gaussian(key, episode, draw + WANDER_DRAW)
-    m[real.WANDER_X] = kept * m[real.WANDER_X] + driven * first
-    m[real.WANDER_Y] = kept * m[real.WANDER_Y] + driven * second
-    if now < m[real.OUTAGE_END]:
-        return
-    if uniform(key, episode, draw + OUTAGE_DRAW) < m[real.GNSS_DROPOUT_RATE] * spacing:
-        m[real.OUTAGE_END] = now + m[real.GNSS_DROPOUT_DURATION]
-        return
-    first, second = gaussian(key, episode, draw + FIX_DRAW)
-    x = memory[X] + m[real.WANDER_X] + m[real.GNSS_NOISE] * first
-    y = memory[Y] + m[real.WANDER_Y] + m[real.GNSS_NOISE] * second
-    if uniform(key, episode, draw + OUTLIER_DRAW) < m[real.GNSS_OUTLIER_RATE]:
-        angle = 2.0 * math.pi * uniform(key, episode, draw + OUTLIER_DRAW + 1)
-        x += m[real.GNSS_OUTLIER_SIZE] * math.cos(angle)
-        y += m[real.GNSS_OUTLIER_SIZE] * math.sin(angle)
+    there, x, y = measure_fix(m, memory[X], memory[Y], spacing, now, key, episode, draw)
     at = int(m[real.WAITING])
-    if (at + 1) * real.WAY <= ways.shape[0]:
+    if there and (at + 1) * real.WAY <= ways.shape[0]:
         place = at * real.WAY
         ways[place], ways[place + 1] = now + m[real.GNSS_LATENCY], now
         ways[place + 2], ways[place + 3] = x, y
@@ -124,15 +154,23 @@ def estimate(
 
 
 @compiled_internal
+def first_fix(m: Array, x: Any, y: Any, key: Any, episode: Any, draw: int) -> tuple[Any, Any]:
+    """Fix of a position before the drive begins: someone has looked that it is a sound one."""
+    first, second = gaussian(key, episode, draw + FIX_DRAW)
+    return (
+        x + m[real.WANDER_X] + m[real.GNSS_NOISE] * first,
+        y + m[real.WANDER_Y] + m[real.GNSS_NOISE] * second,
+    )
+
+
+@compiled_internal
 def begin_estimate(
     m: Array, filter_memory: Array, memory: Array, key: Any, episode: Any, draw: int, spec: Array
 ) -> None:
     """Begin from a first fix, heading and speed, read at standstill on the spot (at 0 s)."""
     kind = int(spec[real.ESTIMATOR])
     e = m[real.ESTIMATE : real.TAIL]
-    first, second = gaussian(key, episode, draw + FIX_DRAW)
-    m[real.FIX_X] = memory[X] + m[real.WANDER_X] + m[real.GNSS_NOISE] * first
-    m[real.FIX_Y] = memory[Y] + m[real.WANDER_Y] + m[real.GNSS_NOISE] * second
+    m[real.FIX_X], m[real.FIX_Y] = first_fix(m, memory[X], memory[Y], key, episode, draw)
     read_sensors(m, memory, key, episode, draw, 0.0)
     for j in range(6):
         e[j] = memory[j]
