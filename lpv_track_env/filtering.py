@@ -19,7 +19,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
+from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, compiled_inverse_speed
 from lpv_track_env.integration import integrate
 from lpv_track_env.kernels import wrap
 from trajectories.compilation import compiled, compiled_internal
@@ -60,6 +60,8 @@ FIX_RESULTS = ("used", "gated", "late", "duplicate", "not finite")
 WORK = 2 * 81
 """Size of the working space."""
 
+SPREAD_STEP = 0.35
+"""Largest product of step and poles where derivatives are taken: four digits of them."""
 NUDGES = (1e-4, 1e-4, 1e-5, 1e-6)
 """Steps of the derivatives by vx, vy, r (m/s, m/s, rad/s) and delta (rad)."""
 
@@ -108,6 +110,15 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
     nx, ny, turn, nr, ahead, aside = integrate(
         vx, vy, 0.0, r, 0.0, 0.0, a, wheels, p0, p1, p2, p3, p4, p5, p6, h, substeps
     )
+    # How things spread needs fewer steps: as many as resolve the lateral poles, whose sum bounds
+    # them.
+    q = compiled_inverse_speed(vx)
+    poles = q * ((p4 + p5) / p0 + (p4 * p2 * p2 + p5 * p3 * p3) / p1)
+    few = min(max(math.ceil(poles * dt / SPREAD_STEP), 1), substeps)
+    h = dt / few
+    bx, by, bent, br, along, across = integrate(
+        vx, vy, 0.0, r, 0.0, 0.0, a, wheels, p0, p1, p2, p3, p4, p5, p6, h, few
+    )
     c, sn = math.cos(psi), math.sin(psi)
     f = work[:81]
     for k in range(81):
@@ -119,15 +130,15 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
         dvx, dvy, dturn, dr, dahead, daside = integrate(
             vx + (step if k == 0 else 0.0), vy + (step if k == 1 else 0.0), 0.0,
             r + (step if k == 2 else 0.0), 0.0, 0.0, a, wheels + (step if k == 3 else 0.0),
-            p0, p1, p2, p3, p4, p5, p6, h, substeps,
+            p0, p1, p2, p3, p4, p5, p6, h, few,
         )  # fmt: skip
         column = VX if k == 0 else VY if k == 1 else YAW_RATE if k == 2 else STEERING_OFFSET
         per = 1.0 / step
-        f[VX * STATES + column] = (dvx - nx) * per
-        f[VY * STATES + column] = (dvy - ny) * per
-        f[YAW_RATE * STATES + column] = (dr - nr) * per
-        f[PSI * STATES + column] = (dturn - turn) * per
-        dahead, daside = (dahead - ahead) * per, (daside - aside) * per
+        f[VX * STATES + column] = (dvx - bx) * per
+        f[VY * STATES + column] = (dvy - by) * per
+        f[YAW_RATE * STATES + column] = (dr - br) * per
+        f[PSI * STATES + column] = (dturn - bent) * per
+        dahead, daside = (dahead - along) * per, (daside - across) * per
         f[X * STATES + column] = c * dahead - sn * daside
         f[Y * STATES + column] = sn * dahead + c * daside
     dx, dy = c * ahead - sn * aside, sn * ahead + c * aside
