@@ -25,7 +25,9 @@ from numpy.typing import NDArray
 from trajectories.atomic import write_atomically
 
 PACKAGES = ("lpv-track-env", "numpy", "scipy", "numba", "casadi", "gymnasium")
-OPTIONAL_PACKAGES = ("torch", "stable-baselines3", "highway-env", "piqp")
+OPTIONAL_PACKAGES = (
+    "torch", "stable-baselines3", "highway-env", "piqp", "rosbags", "commonroad-vehicle-models",
+)  # fmt: skip
 
 Array = NDArray[np.float64]
 

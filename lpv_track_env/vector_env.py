@@ -23,6 +23,13 @@ from lpv_track_env.real_vector import RealVector
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task, action_space
 from lpv_track_env.threads import checked_threads, shares, using_threads
+from lpv_track_env.vector_checks import (
+    checked_actions,
+    checked_mask,
+    checked_mode,
+    checked_seeds,
+    listed,
+)
 from lpv_track_env.vector_infos import episode_infos, final_infos, single_info
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
@@ -35,7 +42,6 @@ MODES = {
     AutoresetMode.SAME_STEP: vector_kernels.SAME_STEP,
     AutoresetMode.DISABLED: vector_kernels.DISABLED,
 }
-ENTRIES = ("0 (acceleration)", "1 (steering angle)")
 
 
 class KernelArrays(NamedTuple):
@@ -147,8 +153,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             )
         if render_mode is not None:
             choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
-        paths: list[str | Path | ReferencePath] = _listed("trajectory", trajectory)
-        cars: list[str | Path | VehicleParameters] = _listed("vehicle", vehicle)
+        paths: list[str | Path | ReferencePath] = listed("trajectory", trajectory)
+        cars: list[str | Path | VehicleParameters] = listed("vehicle", vehicle)
         self.num_envs = operator.index(num_envs)
         self.render_mode = render_mode
         self._single = PathTrackingEnv(
@@ -158,7 +164,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             time_limit=time_limit, initial_error_range=initial_error_range,
             random_start=random_start,
         )  # fmt: skip
-        self.autoreset_mode = _checked_mode(autoreset_mode)
+        self.autoreset_mode = checked_mode(autoreset_mode)
         self._mode = MODES[self.autoreset_mode]
         self.metadata = {**self._single.metadata, **self.metadata}
         self.metadata["autoreset_mode"] = self.autoreset_mode
@@ -274,10 +280,10 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             not one for each environment. Nothing is changed then.
         """
         options = dict(options or {})
-        mask = self._checked_mask(options.pop("reset_mask", None))
+        mask = checked_mask(options.pop("reset_mask", None), self.num_envs)
         for key in options:
             choose("reset option", key, RESET_OPTIONS)
-        seeds = self._checked_seeds(seed)
+        seeds = checked_seeds(seed, self.num_envs)
         drawn, tasks = self._drawn, self.tasks
         if {"trajectory", "vehicle"} & set(options):
             paths = [options["trajectory"]] if "trajectory" in options else self._paths
@@ -345,7 +351,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array]:
         """`step` without infos, for those who do not read them."""
         self._check_order()
-        commands = self._checked_actions(actions)
+        commands = checked_actions(actions, self._ends, self._mode)
         n = self.num_envs
         rewards = np.empty(n)
         if self._real is not None:
@@ -391,50 +397,6 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
                 "reset(options={'reset_mask': mask}) before step()"
             )
 
-    def _checked_actions(self, actions: Any) -> Array:
-        """Actions as float64 (n, 2), after a check of those that are not ignored."""
-        shape = (self.num_envs, 2)
-        try:
-            given = np.asarray(actions)
-        except ValueError:
-            given = np.empty(0)
-        if given.shape != shape or given.dtype.kind not in "fiu":
-            raise ValueError(
-                f"actions must be an array {shape} of numbers [acceleration m/s^2, steering angle "
-                f"rad], not {given.shape} of {given.dtype}"
-            )
-        commands = np.ascontiguousarray(given, dtype=np.float64)
-        bad = vector_kernels.first_bad(commands, self._ends, self._mode)
-        if bad >= 0:
-            index, entry = divmod(bad, 2)
-            raise ValueError(
-                f"action of environment {index}, entry {ENTRIES[entry]}, is not finite: "
-                f"{given[index]!r}"
-            )
-        return commands
-
-    def _checked_mask(self, mask: Any) -> Array:
-        if mask is None:
-            return np.ones(self.num_envs, dtype=np.bool_)
-        if not (isinstance(mask, np.ndarray) and mask.dtype == np.bool_):
-            raise TypeError("options['reset_mask'] must be a NumPy array of dtype bool")
-        if mask.shape != (self.num_envs,):
-            raise ValueError(
-                f"options['reset_mask'] must have shape ({self.num_envs},), not {mask.shape}"
-            )
-        if not mask.any():
-            raise ValueError("options['reset_mask'] must mark at least one environment")
-        return mask.copy()
-
-    def _checked_seeds(self, seed: Any) -> Sequence[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if not isinstance(seed, Sequence):
-            return [operator.index(seed) + i for i in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"{len(seed)} seeds for num_envs={self.num_envs}: give one for each")
-        return list(seed)
-
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Draw every environment: n frames (600, 900, 3) uint8, without trails.
 
@@ -454,19 +416,3 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
     def close_extras(self, **_: Any) -> None:
         """Free what drawing took."""
         self._single.close()
-
-
-def _listed(kind: str, value: Any) -> list[Any]:
-    """Items of a sequence, or the one item; a str is an item."""
-    if not isinstance(value, list | tuple):
-        return [value]
-    if not value:
-        raise ValueError(f"{kind}: an empty sequence")
-    return list(value)
-
-
-def _checked_mode(value: AutoresetMode | str) -> AutoresetMode:
-    if isinstance(value, AutoresetMode):
-        return value
-    known = tuple(mode.value for mode in AutoresetMode)
-    return AutoresetMode(choose("autoreset_mode", value, known))
