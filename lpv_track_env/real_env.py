@@ -31,13 +31,13 @@ from lpv_track_env.real_vehicle import (
     serve,
     stop_acceleration,
 )
-from trajectories.compilation import compiled, compiled_internal
+from trajectories.compilation import compiled, compiled_in_place, compiled_internal
 from trajectories.projection import SEARCH_WINDOW
 
 Array = NDArray[Any]
 
 
-@compiled_internal
+@compiled_in_place
 def take_command(m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array) -> int:
     """Begin a control period: send its command, if it can be; the bits of what was clipped."""
     p, fixes = constants, real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM])
@@ -73,7 +73,7 @@ def take_command(m: Array, memory: Array, a: Any, delta: Any, spec: Array, const
     return bits
 
 
-@compiled_internal
+@compiled_in_place
 def end_period(
     m: Array, memory: Array, vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, bits: int,
     spec: Array, constants: Array, table: Array, observation: Array, key: Any, episode: Any,
@@ -99,7 +99,7 @@ def end_period(
     return end
 
 
-@compiled_internal
+@compiled_in_place
 def drive_real(
     m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array, table: Array,
     observation: Array, key: Any, episode: Any, work: Array,

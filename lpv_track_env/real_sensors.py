@@ -9,7 +9,7 @@ from lpv_track_env import filtering, real
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.draws import gaussian, uniform
 from lpv_track_env.kernels import ACCELERATION, STEERING, clip
-from trajectories.compilation import compiled_internal
+from trajectories.compilation import compiled_in_place, compiled_internal
 
 Array = NDArray[Any]
 
@@ -20,7 +20,7 @@ PERIOD_DRAW, DRAWS = 128, 64
 READINGS_DRAW, FIX_DRAW, WANDER_DRAW, OUTAGE_DRAW, OUTLIER_DRAW, DRIFT_DRAW = 0, 4, 6, 8, 10, 12
 
 
-@compiled_internal
+@compiled_in_place
 def draw_conditions(m: Array, spec: Array, key: Any, episode: Any) -> None:
     """Draw an episode's conditions, and what has been going on when it begins."""
     for j in range(real.COUNT):
@@ -118,7 +118,7 @@ def offset_of(filter_memory: Array, spec: Array) -> Any:
     return clip(offset, -real.WORST_OFFSET, real.WORST_OFFSET)
 
 
-@compiled_internal
+@compiled_in_place
 def estimate(
     m: Array, ways: Array, filter_memory: Array, memory: Array, now: Any, spec: Array, work: Array
 ) -> None:
@@ -163,7 +163,7 @@ def first_fix(m: Array, x: Any, y: Any, key: Any, episode: Any, draw: int) -> tu
     )
 
 
-@compiled_internal
+@compiled_in_place
 def begin_estimate(
     m: Array, filter_memory: Array, memory: Array, key: Any, episode: Any, draw: int, spec: Array
 ) -> None:

@@ -12,7 +12,7 @@ from lpv_track_env.conditions import WIND_LEVER
 from lpv_track_env.draws import gaussian
 from lpv_track_env.integration import integrate
 from lpv_track_env.vehicle import GRAVITY
-from trajectories.compilation import compiled_internal
+from trajectories.compilation import compiled_in_place, compiled_internal
 
 Array = NDArray[Any]
 
@@ -151,7 +151,7 @@ def serve(m: Array, queue: Array, braking: Any, begins: Any, h: Any) -> tuple[An
     return a, delta
 
 
-@compiled_internal
+@compiled_in_place
 def move(
     m: Array, queue: Array, memory: Array, constants: Array, now: Any
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
