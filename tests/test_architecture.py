@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+import lpv_track_env
+
 ROOT = Path(__file__).parents[1]
 LAYERS = ("trajectories", "lpv_track_env", "agents", "experiments")
 """From the lowest: each may import what stands before it."""
@@ -130,3 +132,12 @@ def test_somebody_elses_agents_is_told(tmp_path: Path) -> None:
     assert str(package) in last
     assert "openai-agents" in last
     assert "virtual environment" in last
+
+
+def test_submodules_of_the_environment_load_on_first_use() -> None:
+    folder = ROOT / "lpv_track_env"
+    found = {file.stem for file in folder.glob("*.py")} - {"__init__"}
+    found |= {file.parent.name for file in folder.glob("*/__init__.py")}
+    # Registration has loaded with the package.
+    assert set(lpv_track_env._SUBMODULES) == found - {"registration"}
+    assert lpv_track_env.conditions.REALTIME.name == "realtime"
