@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lpv_track_env.conditions import Actuation
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
+from lpv_track_env.real_vehicle import controlled_stop
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 
@@ -23,8 +24,6 @@ Action = NDArray[np.float32]
 Memory = TypeVar("Memory")
 
 NOTHING_DELAYED = Actuation()
-STOP_DECELERATION = 2.0
-"""m/s^2 of a controlled stop."""
 
 
 class Agent(Protocol):
@@ -84,10 +83,8 @@ def stopping_acceleration(vehicle: VehicleParameters, speed: float) -> float:
     """Acceleration command (m/s^2) of a controlled stop from a speed (m/s), down to standstill."""
     # Where the speed is unknown it rolls on: braking blindly would end in reverse.
     speed = max(speed, 0.0) if math.isfinite(speed) else 0.0
-    # Half the jerk limit brings deceleration and speed to zero together.
-    return vehicle.rolling_deceleration - min(
-        STOP_DECELERATION, math.sqrt(vehicle.max_jerk * speed)
-    )
+    command: float = controlled_stop(vehicle.rolling_deceleration, vehicle.max_jerk, speed)
+    return command
 
 
 class TrackingAgent(ABC, Generic[Memory]):

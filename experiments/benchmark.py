@@ -139,11 +139,17 @@ def finish(store: ResultStore, specs: Sequence[Spec], console: Console) -> int:
     cases = selected(store, specs)
     console.print(console_table(cases))
     report = write_report(store.folder)
+    failed = tell_failed(cases, console)
+    console.print(f"report: {report}", markup=False, highlight=False, soft_wrap=True)
+    return 1 if failed else 0
+
+
+def tell_failed(cases: Sequence[Mapping[str, Any]], console: Console) -> int:
+    """Print a line for each case that failed; how many did."""
     failed = [case for case in cases if case["status"] != "ok"]
     for case in failed:
         console.print(f"failed: {label(case)}: {case['error']}", markup=False, style="red")
-    console.print(f"report: {report}", markup=False, highlight=False, soft_wrap=True)
-    return 1 if failed else 0
+    return len(failed)
 
 
 def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:

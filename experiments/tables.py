@@ -183,7 +183,8 @@ def conditions_words(given: str | Mapping[str, Any]) -> str:
     if isinstance(given, str):
         return given
     rest = {key: value for key, value in given.items() if key != "name"}
-    return f"{given.get('name', 'ideal')} with {_changes(rest)}" if rest else str(given["name"])
+    name = str(given.get("name", "ideal"))
+    return f"{name} with {_changes(rest)}" if rest else name
 
 
 def label_of(case: Result) -> str:

@@ -15,6 +15,7 @@ from lpv_track_env import filtering, kernels
 from lpv_track_env.conditions import DRAWN, ESTIMATORS, Conditions
 from lpv_track_env.task import Task
 from lpv_track_env.vehicle import PARAMETER_ORDER, VehicleParameters
+from trajectories.compilation import compiled_internal
 
 Array = NDArray[np.float64]
 
@@ -63,6 +64,18 @@ SPEC = SETTINGS + filtering.SETTINGS
 EKF, RAW, TRUTH = range(len(ESTIMATORS))
 WORST_OFFSET = 0.1
 """rad; a larger estimate of the steering offset is not believed."""
+
+
+@compiled_internal
+def ways_start(spec: Array) -> int:
+    """Where the fixes on their way begin in a vehicle's memory, behind the commands on theirs."""
+    return TAIL + COMMAND * int(spec[QUEUE_ROOM])
+
+
+@compiled_internal
+def filter_start(spec: Array) -> int:
+    """Where the filter's memory begins in a vehicle's."""
+    return ways_start(spec) + WAY * int(spec[FIX_ROOM])
 
 
 def rooms(conditions: Conditions, period: float) -> tuple[int, int, int]:
@@ -129,25 +142,21 @@ class RealArrays(NamedTuple):
 
     def info(self) -> dict[str, Any]:
         """What infos have besides those of ideal conditions."""
-        return single_report(self.memory)
-
-
-def filter_start(spec: Array) -> int:
-    """Where in a vehicle's memory the filter's begins."""
-    return TAIL + COMMAND * int(spec[QUEUE_ROOM]) + WAY * int(spec[FIX_ROOM])
+        return single_report(self.memory[list(REPORTED)])
 
 
 REPORTED = (*range(ESTIMATE, ESTIMATE + 6), DEVIATION, STOPPING, MISSES)
 """Entries of a memory that infos show: a report, (9,)."""
 
 
-def single_report(memory: Array) -> dict[str, Any]:
+def single_report(report: Array) -> dict[str, Any]:
     """Infos of one vehicle: estimate (6,), position_deviation, stopping, deadline_misses."""
+    deviation, stopping, misses = report[6:].tolist()
     return {
-        "estimate": memory[ESTIMATE : ESTIMATE + 6].copy(),
-        "position_deviation": float(memory[DEVIATION]),
-        "stopping": bool(memory[STOPPING]),
-        "deadline_misses": int(memory[MISSES]),
+        "estimate": report[:6].copy(),
+        "position_deviation": deviation,
+        "stopping": bool(stopping),
+        "deadline_misses": int(misses),
     }
 
 

@@ -40,9 +40,8 @@ Array = NDArray[Any]
 @compiled_in_place
 def take_command(m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array) -> int:
     """Begin a control period: send its command, if it can be; the bits of what was clipped."""
-    p, fixes = constants, real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM])
-    queue = m[real.TAIL : fixes]
-    filter_memory = m[fixes + real.WAY * int(spec[real.FIX_ROOM]) :]
+    p, queue = constants, m[real.TAIL : real.ways_start(spec)]
+    filter_memory = m[real.filter_start(spec) :]
     now = memory[k.STEPS] * p[k.PERIOD]
     bits = 0
     if m[real.FREE_AT] > now + INSTANT:
@@ -80,9 +79,8 @@ def end_period(
     work: Array,
 ) -> int:  # fmt: skip
     """End a control period with a new state: errors, end, reward, sensors, estimate."""
-    p, fixes = constants, real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM])
-    filtered = fixes + real.WAY * int(spec[real.FIX_ROOM])
-    ways, filter_memory = m[fixes:filtered], m[filtered:]
+    p, filtered = constants, real.filter_start(spec)
+    ways, filter_memory = m[real.ways_start(spec) : filtered], m[filtered:]
     end = k.finish(
         memory, p, table, observation, vx, vy, psi, r, x, y, m[real.SERVO_A],
         m[real.SERVO_DELTA], bits,
@@ -108,7 +106,7 @@ def drive_real(
     bits = take_command(m, memory, a, delta, spec, constants)
     period = constants[k.PERIOD]
     blow(m, key, episode, PERIOD_DRAW + DRAWS * (int(memory[k.STEPS]) + 1), period)
-    queue = m[real.TAIL : real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM])]
+    queue = m[real.TAIL : real.ways_start(spec)]
     vx, vy, psi, r, x, y = move(m, queue, memory, constants, memory[k.STEPS] * period)
     return end_period(
         m, memory, vx, vy, psi, r, x, y, bits, spec, constants, table, observation, key, episode,
@@ -151,10 +149,7 @@ def begin_real(
     m[real.TAIL] = 0.0
     m[real.TAIL + 1], m[real.TAIL + 2] = memory[k.ACCELERATION], memory[k.STEERING]
     m[real.QUEUED] = 1.0
-    filtered = (
-        real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM]) + real.WAY * int(spec[real.FIX_ROOM])
-    )
-    begin_estimate(m, m[filtered:], memory, key, episode, PERIOD_DRAW, spec)
+    begin_estimate(m, m[real.filter_start(spec) :], memory, key, episode, PERIOD_DRAW, spec)
     e = m[real.ESTIMATE : real.TAIL]
     e[k.ACCELERATION], e[k.STEERING] = memory[k.ACCELERATION], memory[k.STEERING]
     if spec[real.ESTIMATOR] == real.TRUTH:
@@ -196,7 +191,7 @@ def command_real(data: Array, m: Array, spec: Array) -> tuple[Any, Any, int]:
     """
     memory, constants = data[k.MEMORY : k.CONSTANTS], data[k.CONSTANTS : k.OBSERVATION]
     bits = take_command(m, memory, data[0], data[1], spec, constants)
-    queue = m[real.TAIL : real.TAIL + real.COMMAND * int(spec[real.QUEUE_ROOM])]
+    queue = m[real.TAIL : real.ways_start(spec)]
     substeps, now = int(constants[k.SUBSTEPS]), memory[k.STEPS] * constants[k.PERIOD]
     h = constants[k.PERIOD] / substeps
     braking = stop_acceleration(m, constants)

@@ -53,6 +53,16 @@ def read_sensors(m: Array, memory: Array, key: Any, episode: Any, draw: int, per
 
 
 @compiled_internal
+def sound_fix(m: Array, x: Any, y: Any, key: Any, episode: Any, draw: int) -> tuple[Any, Any]:
+    """Fix of a position with the errors that every fix has."""
+    first, second = gaussian(key, episode, draw + FIX_DRAW)
+    return (
+        x + (m[real.WANDER_X] + m[real.GNSS_NOISE] * first),
+        y + (m[real.WANDER_Y] + m[real.GNSS_NOISE] * second),
+    )
+
+
+@compiled_internal
 def measure_fix(
     m: Array, x: Any, y: Any, spacing: Any, now: Any, key: Any, episode: Any, draw: int
 ) -> tuple[bool, Any, Any]:
@@ -67,9 +77,7 @@ def measure_fix(
     if uniform(key, episode, draw + OUTAGE_DRAW) < m[real.GNSS_DROPOUT_RATE] * spacing:
         m[real.OUTAGE_END] = now + m[real.GNSS_DROPOUT_DURATION]
         return False, x, y
-    first, second = gaussian(key, episode, draw + FIX_DRAW)
-    x += m[real.WANDER_X] + m[real.GNSS_NOISE] * first
-    y += m[real.WANDER_Y] + m[real.GNSS_NOISE] * second
+    x, y = sound_fix(m, x, y, key, episode, draw)
     if uniform(key, episode, draw + OUTLIER_DRAW) < m[real.GNSS_OUTLIER_RATE]:
         angle = 2.0 * math.pi * uniform(key, episode, draw + OUTLIER_DRAW + 1)
         x += m[real.GNSS_OUTLIER_SIZE] * math.cos(angle)
@@ -153,24 +161,14 @@ def estimate(
         e[STEERING] = m[real.SERVO_DELTA] + m[real.STEERING_OFFSET]
 
 
-@compiled_internal
-def first_fix(m: Array, x: Any, y: Any, key: Any, episode: Any, draw: int) -> tuple[Any, Any]:
-    """Fix of a position before the drive begins: someone has looked that it is a sound one."""
-    first, second = gaussian(key, episode, draw + FIX_DRAW)
-    return (
-        x + m[real.WANDER_X] + m[real.GNSS_NOISE] * first,
-        y + m[real.WANDER_Y] + m[real.GNSS_NOISE] * second,
-    )
-
-
 @compiled_in_place
 def begin_estimate(
     m: Array, filter_memory: Array, memory: Array, key: Any, episode: Any, draw: int, spec: Array
 ) -> None:
-    """Begin from a first fix, heading and speed, read at standstill on the spot (at 0 s)."""
+    """Begin from a first fix, heading and speed, read on the spot (at 0 s); no outlier."""
     kind = int(spec[real.ESTIMATOR])
     e = m[real.ESTIMATE : real.TAIL]
-    m[real.FIX_X], m[real.FIX_Y] = first_fix(m, memory[X], memory[Y], key, episode, draw)
+    m[real.FIX_X], m[real.FIX_Y] = sound_fix(m, memory[X], memory[Y], key, episode, draw)
     read_sensors(m, memory, key, episode, draw, 0.0)
     for j in range(6):
         e[j] = memory[j]

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from lpv_track_env import filtering, real
 from lpv_track_env import kernels as k
 from lpv_track_env.conditions import Conditions
-from lpv_track_env.draws import choice
-from lpv_track_env.episodes import TRAJECTORY_DRAW, VEHICLE_DRAW
 from lpv_track_env.real_env import begin_real, drive_real
 from lpv_track_env.task import Task
 from lpv_track_env.threads import shares, using_threads
-from lpv_track_env.vector_kernels import NEXT_STEP, SAME_STEP, copy
+from lpv_track_env.vector_kernels import NEXT_STEP, SAME_STEP, copy, draw_case
 from trajectories.compilation import compiled, compiled_internal, compiled_parallel
 
 Array = NDArray[Any]
@@ -28,11 +26,7 @@ def begin_next(
 ) -> None:  # fmt: skip
     """`vector_kernels.begin_next` under conditions; `draws` holds key and episode, (2,)."""
     draws[1] += np.uint64(1)
-    case, paths, vehicles = drawn
-    if paths > 1:
-        case += vehicles * choice(draws[0], draws[1], TRAJECTORY_DRAW, paths)
-    if vehicles > 1:
-        case += choice(draws[0], draws[1], VEHICLE_DRAW, vehicles)
+    case = draw_case(drawn, draws[0], draws[1])
     cases[i] = case
     table = tables[rows[case, 0] : rows[case, 1]]
     begin_real(m, memory, specs[case], constants[case], table, observation, draws, given)
@@ -173,10 +167,8 @@ class RealVector:
 
     def single_info(self, index: int) -> dict[str, Any]:
         """Infos of one vehicle."""
-        return real.single_report(self.reals[index])
+        return real.single_report(self.reals[index, list(real.REPORTED)])
 
     def final_info(self, index: int) -> dict[str, Any]:
         """Infos of one vehicle's episode that has just ended, in SAME_STEP."""
-        memory = np.zeros(real.TAIL)
-        memory[list(real.REPORTED)] = self._final_reports[index]
-        return real.single_report(memory)
+        return real.single_report(self._final_reports[index])

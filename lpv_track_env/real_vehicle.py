@@ -23,7 +23,18 @@ GUST_DRAW = 32
 INSTANT = 1e-9
 """s that are no time: rounding of sums of periods."""
 STOP_DECELERATION = 2.0
-"""m/s^2 of the brakes when the vehicle stops by itself; `agents.base` stops likewise."""
+"""m/s^2 of a controlled stop."""
+
+
+def controlled_stop(rolling_deceleration: Any, max_jerk: Any, speed: Any) -> Any:
+    """Acceleration command (m/s^2) that brakes from a speed >= 0 (m/s) down to standstill.
+
+    Half the jerk limit (m/s^3) brings deceleration and speed to zero together.
+    """
+    return rolling_deceleration - min(STOP_DECELERATION, math.sqrt(max_jerk * speed))
+
+
+compiled_controlled_stop = compiled_internal(controlled_stop)
 
 
 @compiled_internal
@@ -124,9 +135,8 @@ def stop_acceleration(m: Array, constants: Array) -> Any:
     """Acceleration that brakes to a stop by the estimated speed, within the jerk limit, m/s^2."""
     speed = max(m[real.ESTIMATE + VX], 0.0)
     jerk = constants[k.ACCELERATION_STEP] / constants[k.PERIOD]
-    # Half the jerk limit brings deceleration and speed to zero together.
-    braking = min(STOP_DECELERATION, math.sqrt(jerk * speed))
-    return max(constants[6] - braking, m[real.SERVO_A] - constants[k.ACCELERATION_STEP])
+    wanted = compiled_controlled_stop(constants[6], jerk, speed)
+    return max(wanted, m[real.SERVO_A] - constants[k.ACCELERATION_STEP])
 
 
 @compiled_internal

@@ -32,7 +32,7 @@ def _fix(
     m: Array, x: Any, y: Any, spacing: Any, now: Any, key: Any, draw: int
 ) -> tuple[bool, Any, Any]:
     if now < 0.0:
-        first, second = real_sensors.first_fix(m, x, y, key, 0, draw)
+        first, second = real_sensors.sound_fix(m, x, y, key, 0, draw)
         return True, first, second
     return real_sensors.measure_fix(m, x, y, spacing, now, key, 0, draw)
 

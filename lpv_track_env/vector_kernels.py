@@ -111,21 +111,28 @@ def first_bad(commands: Array, ends: Array, mode: int) -> int:
 
 
 @compiled_internal
-def begin_next(
-    i: int, memory: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
-    rows: Array, observation: Array, keys: Array, episodes: Array, given: Array,
-) -> None:  # fmt: skip
-    """Begin the next episode of environment i, on a path and with a vehicle that are drawn.
+def draw_case(drawn: Any, key: Any, episode: Any) -> Any:
+    """Draw the case of an episode, its path and its vehicle.
 
     `drawn` holds the first case to draw from, the number of paths and that of vehicles; cases list
     the combinations, vehicles side by side.
     """
-    episodes[i] += 1
     case, paths, vehicles = drawn
     if paths > 1:
-        case += vehicles * choice(keys[i], episodes[i], TRAJECTORY_DRAW, paths)
+        case += vehicles * choice(key, episode, TRAJECTORY_DRAW, paths)
     if vehicles > 1:
-        case += choice(keys[i], episodes[i], VEHICLE_DRAW, vehicles)
+        case += choice(key, episode, VEHICLE_DRAW, vehicles)
+    return case
+
+
+@compiled_internal
+def begin_next(
+    i: int, memory: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
+    rows: Array, observation: Array, keys: Array, episodes: Array, given: Array,
+) -> None:  # fmt: skip
+    """Begin the next episode of environment i, on a path and with a vehicle that are drawn."""
+    episodes[i] += 1
+    case = draw_case(drawn, keys[i], episodes[i])
     cases[i] = case
     table = tables[rows[case, 0] : rows[case, 1]]
     begin(memory, constants[case], table, observation, keys[i], episodes[i], given)

@@ -93,6 +93,24 @@ def test_recorded_times_of_the_filter_and_the_solvers() -> None:
     assert recorded["lpv-nmpc"][32] < recorded["lpv-nmpc-ipopt"][32]
 
 
+def test_no_table_of_what_is_left_where_cases_failed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ablation, "GROUPS", {})
+    monkeypatch.setattr(ablation, "WITHOUT_FILTER", {})
+    faulty = tmp_path / "faulty.py"
+    faulty.write_text(
+        "class Faulty:\n"
+        "    def __init__(self, task): pass\n"
+        "    def predict(self, *arguments, **settings): raise ArithmeticError('no idea')\n"
+    )
+    command = ["ablation", "--agent", f"{faulty}:Faulty", "--trajectories", "u-turn", "--seeds",
+               "1", "--workers", "1", "--out", str(tmp_path / "out")]  # fmt: skip
+    assert cli.main(command) == 1
+    assert capsys.readouterr().out.count("no idea") >= 4
+    assert not (tmp_path / "out" / "ablation.json").exists()
+
+
 def test_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wrong = tmp_path / "times.json"
     wrong.write_text('{"ekf": [0.1]}')
