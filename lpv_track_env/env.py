@@ -11,15 +11,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lpv_track_env import episodes, kernels, plants, real, real_env, real_vehicle, vehicle
-from lpv_track_env.conditions import LONGEST_DELAY, Actuation, Conditions
+from lpv_track_env import conditions_episode, episodes, kernels, plants, vehicle
+from lpv_track_env.conditions import Actuation, Conditions
 from lpv_track_env.conditions import load as load_conditions
+from lpv_track_env.conditions_layout import ConditionsArrays
 from lpv_track_env.draws import random_key
 from lpv_track_env.episodes import given_start
 from lpv_track_env.naming import choose
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.plants.episode import PlantEpisode
-from lpv_track_env.real import RealArrays
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.task import Task, action_space, checked_period, reference
 from lpv_track_env.vector_infos import single_info
@@ -194,7 +194,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._running = False
         self._draws = np.zeros(2, dtype=np.uint64)
         self._key, self._episode = np.uint64(0), -1
-        self._real: RealArrays | None = None
+        self._conditioned: ConditionsArrays | None = None
         self._renderer: Renderer | None = None
         self._open_views()
         self._use(self.base_task, self._plant_of(self.base_task))
@@ -214,7 +214,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             return
         self.task, self._plant = task, plant
         self._constants[:] = task.constants()
-        self._real = RealArrays.of(task)
+        self._conditioned = ConditionsArrays.of(task)
         self._take_table(task.path.table)
 
     def _plant_of(self, task: Task) -> PlantEpisode | None:
@@ -226,16 +226,16 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _take_table(self, table: NDArray[np.float64]) -> None:
         self._table = table
         self._arguments: tuple[NDArray[Any], ...] = (self._episode_data, table)
-        if self._real is not None:
-            self._arguments = (self._episode_data, table, *self._real, self._draws)
+        if self._conditioned is not None:
+            self._arguments = (self._episode_data, table, *self._conditioned, self._draws)
         self._advance: Callable[..., Any] = self._first_advance
 
     def _first_advance(self, *arguments: NDArray[Any]) -> Any:
         """Have the kernel compiled where it is needed, in a first step, and go there."""
         if self._plant is not None:
             self._advance = self._plant.advance
-        elif self._real is not None:
-            self._advance = entry_point(real_env.advance_real, *arguments)
+        elif self._conditioned is not None:
+            self._advance = entry_point(conditions_episode.advance_under_conditions, *arguments)
         else:
             self._advance = entry_point(kernels.advance, *arguments)
         return self._advance(*arguments)
@@ -273,10 +273,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     @property
     def controller_busy(self) -> bool:
         """Whether the controller still computes an earlier action: the next will be dropped."""
-        if self._real is None:
-            return False
-        now = self._memory[kernels.STEPS] * self.control_period
-        return bool(self._real.memory[real.FREE_AT] > now + real_vehicle.INSTANT)
+        now = float(self._memory[kernels.STEPS] * self.control_period)
+        return self._conditioned is not None and self._conditioned.busy_at(now)
 
     def set_computing_time(self, latency: float, occupied: float | None = None) -> None:
         """Say how long the next step's action took to compute, in place of `computing_delay`.
@@ -294,12 +292,9 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         ValueError
             Under conditions "simulation", where commands land at once, or for a negative time.
         """
-        if self._real is None:
+        if self._conditioned is None:
             raise ValueError("conditions 'simulation' have no delays: make the env with others")
-        occupied = latency if occupied is None else occupied
-        if not (0.0 <= latency <= LONGEST_DELAY and 0.0 <= occupied <= LONGEST_DELAY):
-            raise ValueError(f"computing times must be 0 to {LONGEST_DELAY:g} s")
-        self._real.memory[real.LATENCY], self._real.memory[real.OCCUPIED] = latency, occupied
+        self._conditioned.set_computing_time(latency, latency if occupied is None else occupied)
 
     @property
     def layout(self) -> ObservationLayout:
@@ -325,16 +320,16 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         super().reset(seed=seed)
         self._count_episode(reseeded=seed is not None)
         self._use(task, plant)
-        if self._real is None:
+        if self._conditioned is None:
             episodes.begin(
                 self._memory, self._constants, self._table, self._observation,
                 self._key, self._episode, given,
             )  # fmt: skip
         else:
             self._draws[:] = self._key, self._episode
-            real_env.begin_real(
-                self._real.memory, self._memory, self._real.spec, self._constants, self._table,
-                self._observation, self._draws, given,
+            conditions_episode.begin_under_conditions(
+                self._conditioned.memory, self._memory, self._conditioned.spec, self._constants,
+                self._table, self._observation, self._draws, given,
             )  # fmt: skip
         if plant is not None:
             plant.begin(self._memory)
@@ -344,8 +339,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self.render_mode == "human":
             self.render()
         info = single_info(self._memory)
-        if self._real is not None:
-            info.update(self._real.info())
+        if self._conditioned is not None:
+            info.update(self._conditioned.info())
         return self._observation.copy(), info
 
     def _count_episode(self, *, reseeded: bool) -> None:
@@ -395,8 +390,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             terms["heading"], terms["speed"], terms["input_rate"], terms["end"],
         ) = self._advance(*self._arguments)  # fmt: skip
         info["state"] = self._state.copy()
-        if self._real is not None:
-            info.update(self._real.info())
+        if self._conditioned is not None:
+            info.update(self._conditioned.info())
         terminated = truncated = False
         if end:
             if end == kernels.NOT_FINITE:

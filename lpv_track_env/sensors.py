@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lpv_track_env import real, real_sensors
+from lpv_track_env import conditions_layout, conditions_sensors
 from lpv_track_env.bicycle import PSI, STATE_SIZE, VX, YAW_RATE
 from lpv_track_env.conditions import DRAWN, Conditions
 from lpv_track_env.draws import random_key
@@ -19,12 +19,12 @@ Array = NDArray[Any]
 
 @compiled
 def _draw(m: Array, spec: Array, key: Any) -> None:
-    real_sensors.draw_conditions(m, spec, key, 0)
+    conditions_sensors.draw_conditions(m, spec, key, 0)
 
 
 @compiled
 def _read(m: Array, state: Array, key: Any, draw: int, period: Any) -> None:
-    real_sensors.read_sensors(m, state, key, 0, draw, period)
+    conditions_sensors.read_sensors(m, state, key, 0, draw, period)
 
 
 @compiled
@@ -32,9 +32,9 @@ def _fix(
     m: Array, x: Any, y: Any, spacing: Any, now: Any, key: Any, draw: int
 ) -> tuple[bool, Any, Any]:
     if now < 0.0:
-        first, second = real_sensors.sound_fix(m, x, y, key, 0, draw)
+        first, second = conditions_sensors.sound_fix(m, x, y, key, 0, draw)
         return True, first, second
-    return real_sensors.measure_fix(m, x, y, spacing, now, key, 0, draw)
+    return conditions_sensors.measure_fix(m, x, y, spacing, now, key, 0, draw)
 
 
 class Sensors:
@@ -53,11 +53,11 @@ class Sensors:
 
     def __init__(self, conditions: Conditions, seed: int = 0) -> None:
         # Of the spec only the ranges and the fixes' period are read.
-        spec = np.zeros(real.SPEC)
-        spec[: 2 * real.COUNT] = conditions.ranges().ravel()
-        spec[real.GNSS_PERIOD] = conditions.gnss_period
+        spec = np.zeros(conditions_layout.SPEC)
+        spec[: 2 * conditions_layout.COUNT] = conditions.ranges().ravel()
+        spec[conditions_layout.GNSS_PERIOD] = conditions.gnss_period
         self._key = random_key(np.random.default_rng(seed))
-        self._memory, self._state = np.zeros(real.TAIL), np.zeros(STATE_SIZE)
+        self._memory, self._state = np.zeros(conditions_layout.TAIL), np.zeros(STATE_SIZE)
         self._calls = 0
         self._inertial_time = self._fix_time = 0.0
         _draw(self._memory, spec, self._key)
@@ -72,13 +72,15 @@ class Sensors:
         self._state[PSI], self._state[YAW_RATE] = heading, yaw_rate
         self._read(max(time - self._inertial_time, 0.0))
         self._inertial_time = time
-        return float(self._memory[real.READ_HEADING]), float(self._memory[real.READ_YAW_RATE])
+        return float(self._memory[conditions_layout.READ_HEADING]), float(
+            self._memory[conditions_layout.READ_YAW_RATE]
+        )
 
     def wheel_speed(self, speed: float) -> float:
         """Speed (m/s) as the wheels tell it."""
         self._state[VX] = speed
         self._read(0.0)
-        return float(self._memory[real.READ_SPEED])
+        return float(self._memory[conditions_layout.READ_SPEED])
 
     def first_fix(self, x: float, y: float) -> tuple[float, float]:
         """A fix (m) before the drive begins: there is one, and it is no outlier."""
@@ -101,4 +103,4 @@ class Sensors:
 
     def _next(self) -> int:
         self._calls += 1
-        return real_sensors.PERIOD_DRAW + real_sensors.DRAWS * self._calls
+        return conditions_sensors.PERIOD_DRAW + conditions_sensors.DRAWS * self._calls

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from lpv_track_env import kernels, vector_kernels
 from lpv_track_env.conditions import Conditions
+from lpv_track_env.conditions_vector import ConditionsVector
 from lpv_track_env.draws import random_key
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.episodes import GIVEN, given_start
 from lpv_track_env.naming import choose
 from lpv_track_env.plants import BICYCLE
-from lpv_track_env.real_vector import RealVector
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task, action_space
 from lpv_track_env.threads import checked_threads, shares, using_threads
@@ -172,9 +172,9 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._paths, self._cars = paths, cars
         self._drawn = (0, len(paths), len(cars))
         self.tasks = self._tasks_of(paths, cars)
-        self._real: RealVector | None = None
+        self._conditioned: ConditionsVector | None = None
         if (given := self._single.conditions) is not None:
-            self._real = RealVector(
+            self._conditioned = ConditionsVector(
                 given, self.num_envs, self._single.control_period, self._threads
             )
         self._pack(self.tasks)
@@ -216,8 +216,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
                 tables.append(task.path.table)
             rows.append((first, first + len(tables[-1])))
         self._tables, self._rows = np.concatenate(tables), np.array(rows)
-        if self._real is not None:
-            self._real.pack(tasks)
+        if self._conditioned is not None:
+            self._conditioned.pack(tasks)
 
     def task_of(self, index: int) -> Task:
         """Task of the current episode of environment `index`: its path, its vehicle."""
@@ -249,16 +249,16 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
     def info_of(self, index: int) -> Infos:
         """Info of environment `index`, as the single environment gives it, without its end."""
         info = single_info(self._memories[index])
-        if self._real is not None:
-            info.update(self._real.single_info(index))
+        if self._conditioned is not None:
+            info.update(self._conditioned.single_info(index))
         return info
 
     def final_of(self, index: int) -> tuple[Infos, Array]:
         """Last info and observation of environment `index`, which just ended in SAME_STEP."""
         memory = self._final_memories[index]
         info = {**single_info(memory), "end": kernels.END_NAMES[int(memory[kernels.END])]}
-        if self._real is not None:
-            info.update(self._real.final_info(index))
+        if self._conditioned is not None:
+            info.update(self._conditioned.final_info(index))
         return info, self._final_observations[index].copy()
 
     @property
@@ -296,13 +296,13 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             super().reset(seed=seed)
         self._take_keys(seeds, mask)
         self._pack_beside(tasks if tasks is not self.tasks else [], mask)
-        if self._real is None:
+        if self._conditioned is None:
             vector_kernels.begin_all(
                 mask, self._memories, self._cases, drawn, self._constants, self._tables,
                 self._rows, self._keys, self._episodes, given, self._observations, self._ends,
             )  # fmt: skip
         else:
-            self._real.begin(
+            self._conditioned.begin(
                 mask, self._keys, self._episodes,
                 (
                     self._memories, self._cases, drawn, self._constants, self._tables, self._rows,
@@ -310,8 +310,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
                 ),
             )  # fmt: skip
         infos = episode_infos(self._memories, mask)
-        if self._real is not None:
-            infos.update(self._real.infos(mask))
+        if self._conditioned is not None:
+            infos.update(self._conditioned.infos(mask))
         return self._observations.copy(), infos
 
     def _pack_beside(self, extra: list[Task], mask: Array) -> None:
@@ -340,12 +340,12 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         observations, rewards, terminated, truncated = self.advance(actions)
         infos = episode_infos(self._memories)
         ended = terminated | truncated
-        if self._real is not None:
-            infos.update(self._real.infos(np.ones(self.num_envs, dtype=np.bool_)))
+        if self._conditioned is not None:
+            infos.update(self._conditioned.infos(np.ones(self.num_envs, dtype=np.bool_)))
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
             infos.update(final_infos(self._final_memories, self._final_observations, ended))
-            if self._real is not None:
-                infos["final_info"].update(self._real.final_infos(ended))
+            if self._conditioned is not None:
+                infos["final_info"].update(self._conditioned.final_infos(ended))
         return observations, rewards, terminated, truncated, infos
 
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array]:
@@ -354,8 +354,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         commands = checked_actions(actions, self._ends, self._mode)
         n = self.num_envs
         rewards = np.empty(n)
-        if self._real is not None:
-            self._real.advance(
+        if self._conditioned is not None:
+            self._conditioned.advance(
                 self._mode, self._keys, self._episodes,
                 (
                     self._memories, commands, self._cases, self._drawn, self._constants,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lpv_track_env import conditions, real
+from lpv_track_env import conditions, conditions_layout
 from lpv_track_env.conditions import DRAWN, IDEAL, REALTIME, Conditions
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.estimator import EstimatorSettings
@@ -83,8 +83,8 @@ def test_draws_are_uniform_over_the_ranges_and_differ_between_episodes() -> None
     drawn = []
     for seed in range(400):
         env.reset(seed=seed)
-        assert env._real is not None
-        drawn.append(env._real.memory[: len(DRAWN)].copy())
+        assert env._conditioned is not None
+        drawn.append(env._conditioned.memory[: len(DRAWN)].copy())
     values = np.array(drawn)
     ranges = REALTIME.ranges()
     np.testing.assert_array_equal(values.min(axis=0) >= ranges[:, 0], True)
@@ -97,16 +97,16 @@ def test_draws_are_uniform_over_the_ranges_and_differ_between_episodes() -> None
     correlation = np.corrcoef(shares.T) - np.eye(spread.sum())
     assert np.abs(correlation).max() < 4.5 / math.sqrt(400)
     env.reset(seed=5)
-    first = env._real.memory[: len(DRAWN)].copy()
+    first = env._conditioned.memory[: len(DRAWN)].copy()
     env.reset()
-    assert (env._real.memory[: len(DRAWN)] != first)[spread].all()
+    assert (env._conditioned.memory[: len(DRAWN)] != first)[spread].all()
     env.reset(seed=5)
-    np.testing.assert_array_equal(env._real.memory[: len(DRAWN)], first)
+    np.testing.assert_array_equal(env._conditioned.memory[: len(DRAWN)], first)
 
 
 def test_memory_indices_follow_the_fields() -> None:
     for index, name in enumerate(DRAWN):
-        assert getattr(real, name.upper()) == index
+        assert getattr(conditions_layout, name.upper()) == index
 
 
 BAD: dict[str, tuple[Any, str]] = {
@@ -149,5 +149,5 @@ def test_bad_values(name: str, value: Any) -> None:
 
 
 def test_all_drawn_fields_are_ranges() -> None:
-    assert len(DRAWN) == real.COUNT
+    assert len(DRAWN) == conditions_layout.COUNT
     assert {item.name for item in fields(Conditions)} > set(DRAWN)

@@ -21,9 +21,9 @@ from experiments.bags.topics import (
     Odometry,
     Stamps,
 )
+from lpv_track_env.conditions_layout import WORST_OFFSET
 from lpv_track_env.estimator import Estimator, EstimatorSettings
 from lpv_track_env.observer import PathObserver
-from lpv_track_env.real import WORST_OFFSET
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lpv_track_env import kernels, real_env
+from lpv_track_env import conditions_episode, kernels
 from lpv_track_env.plants import Plant
 
 Array = NDArray[np.float64]
@@ -28,17 +28,17 @@ class PlantEpisode:
         """Take over the state and the steering angle that an episode begins with."""
         self.plant.begin(memory[:6].copy(), float(memory[kernels.STEERING]))
 
-    def advance(self, episode: Array, table: Array, *real: Any) -> tuple[float, ...]:
+    def advance(self, episode: Array, table: Array, *conditioned: Any) -> tuple[float, ...]:
         """Drive one control period in place: arguments and result as of `kernels.advance`.
 
-        Under conditions, with those of `real_env.advance_real`: what they do to sensors, actuators
-        and commands holds for every plant; mass, tyres and wind are the plant's own.
+        Under conditions, with those of `advance_under_conditions`: what they do to sensors,
+        actuators and commands holds for every plant; mass, tyres and wind are the plant's own.
         """
         end = kernels.NOT_FINITE
         if math.isfinite(episode[0]) and math.isfinite(episode[1]):
-            if real:
-                memory, spec = real[:2]
-                a, delta, bits = real_env.command_real(episode, memory, spec)
+            if conditioned:
+                memory, spec = conditioned[:2]
+                a, delta, bits = conditions_episode.command_under_conditions(episode, memory, spec)
             else:
                 a, delta, bits = kernels.command(episode)
             period = float(episode[kernels.CONSTANTS + kernels.PERIOD])
@@ -46,9 +46,9 @@ class PlantEpisode:
                 state = np.asarray(self.plant.advance(a, delta, period), dtype=np.float64)
             except (ArithmeticError, ValueError):
                 state = np.full(6, np.nan)
-            if real:
-                given: Any = (episode, table, *real, state, bits)
-                end = real_env.conclude_real(*given)
+            if conditioned:
+                given: Any = (episode, table, *conditioned, state, bits)
+                end = conditions_episode.conclude_under_conditions(*given)
             else:
                 vx, vy, psi, r, x, y = state.tolist()
                 end = kernels.conclude(episode, table, vx, vy, psi, r, x, y, a, delta, bits)

@@ -11,11 +11,11 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 import trajectories
-from lpv_track_env import real
+from lpv_track_env import conditions_layout
 from lpv_track_env.bicycle import VX, VY, YAW_RATE, X, Y, derivative
 from lpv_track_env.conditions import IDEAL, REALTIME, WIND_LEVER, Conditions
+from lpv_track_env.conditions_vehicle import AIR_DENSITY, secant
 from lpv_track_env.env import PathTrackingEnv
-from lpv_track_env.real_vehicle import AIR_DENSITY, secant
 from lpv_track_env.vehicle import GRAVITY, VEHICLES
 
 Array = NDArray[np.float64]
@@ -173,8 +173,8 @@ def test_no_more_lateral_force_than_friction() -> None:
 def test_side_wind_pushes_by_its_force() -> None:
     """First period of a straight drive: lateral and yaw acceleration by the air's force."""
     env = straight(wind_speed=8.0)
-    assert env._real is not None
-    wind = 8.0 * env._real.memory[[real.WIND_X, real.WIND_Y]]
+    assert env._conditioned is not None
+    wind = 8.0 * env._conditioned.memory[[conditions_layout.WIND_X, conditions_layout.WIND_Y]]
     ahead, aside = wind - [10.0, 0.0]
     force = 0.5 * AIR_DENSITY * 12.0 * math.hypot(ahead, aside) * aside
     # Within 0.1 ms neither tyres nor heading have answered.

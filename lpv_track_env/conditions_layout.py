@@ -1,8 +1,8 @@
-"""Memory of a vehicle under conditions other than ideal, and how conditions reach the kernels.
+"""Layout of what the kernels know of a vehicle under conditions, and how conditions reach them.
 
-`real` is one float64 array a vehicle: what its `conditions` were drawn to, actuators, commands on
-their way, wind, sensors, the estimate as a memory of its own (`kernels`), the filter (`filtering`).
-`spec` is one float64 array an environment: the ranges to draw from, settings, sizes.
+A vehicle has one float64 array: what its `conditions` were drawn to, actuators, commands on their
+way, wind, sensors, the estimate as a memory of its own (`kernels`), the filter (`filtering`). An
+environment has one, its spec: the ranges to draw from, settings, sizes.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env import filtering, kernels
-from lpv_track_env.conditions import DRAWN, ESTIMATORS, Conditions
+from lpv_track_env.conditions import DRAWN, ESTIMATORS, LONGEST_DELAY, Conditions
 from lpv_track_env.task import Task
 from lpv_track_env.vehicle import PARAMETER_ORDER, VehicleParameters
 from trajectories.compilation import compiled_internal
@@ -62,6 +62,8 @@ SETTINGS = INITIAL + filtering.STATES
 SPEC = SETTINGS + filtering.SETTINGS
 
 EKF, RAW, TRUTH = range(len(ESTIMATORS))
+INSTANT = 1e-9
+"""s that are no time: rounding of sums of periods."""
 WORST_OFFSET = 0.1
 """rad; a larger estimate of the steering offset is not believed."""
 
@@ -94,7 +96,7 @@ def rooms(conditions: Conditions, period: float) -> tuple[int, int, int]:
 
 
 def memory_size(conditions: Conditions, period: float) -> int:
-    """Length of a vehicle's `real` under some conditions and a control period (s)."""
+    """Length of a vehicle's array under some conditions and a control period (s)."""
     commands, fixes, nodes = rooms(conditions, period)
     return TAIL + COMMAND * commands + WAY * fixes + filtering.FILTER + filtering.NODE * nodes
 
@@ -121,7 +123,7 @@ def spec_of(conditions: Conditions, vehicle: VehicleParameters, period: float) -
     )
 
 
-class RealArrays(NamedTuple):
+class ConditionsArrays(NamedTuple):
     """What the kernels take of one vehicle under conditions."""
 
     memory: Array
@@ -130,7 +132,7 @@ class RealArrays(NamedTuple):
     """Working space of the filter."""
 
     @classmethod
-    def of(cls, task: Task) -> "RealArrays | None":
+    def of(cls, task: Task) -> "ConditionsArrays | None":
         """Arrays for a task; None under conditions `simulation`."""
         if task.conditions is None:
             return None
@@ -139,6 +141,22 @@ class RealArrays(NamedTuple):
             spec_of(task.conditions, task.vehicle, task.control_period),
             np.zeros(filtering.WORK),
         )
+
+    def busy_at(self, now: float) -> bool:
+        """Whether the controller still computes an earlier command at `now` (s)."""
+        return bool(self.memory[FREE_AT] > now + INSTANT)
+
+    def set_computing_time(self, latency: float, occupied: float) -> None:
+        """Set latency and occupation of the next computation, s.
+
+        Raises
+        ------
+        ValueError
+            If one is negative or longer than the memory is made for.
+        """
+        if not (0.0 <= latency <= LONGEST_DELAY and 0.0 <= occupied <= LONGEST_DELAY):
+            raise ValueError(f"computing times must be 0 to {LONGEST_DELAY:g} s")
+        self.memory[LATENCY], self.memory[OCCUPIED] = latency, occupied
 
     def info(self) -> dict[str, Any]:
         """What infos have besides those of ideal conditions."""

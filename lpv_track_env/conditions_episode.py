@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lpv_track_env import filtering, real
+from lpv_track_env import conditions_layout as layout
+from lpv_track_env import filtering
 from lpv_track_env import kernels as k
-from lpv_track_env.episodes import begin
-from lpv_track_env.real_sensors import (
+from lpv_track_env.conditions_sensors import (
     DRAWS,
     PERIOD_DRAW,
     begin_estimate,
@@ -22,8 +22,7 @@ from lpv_track_env.real_sensors import (
     read_sensors,
     receive_satellites,
 )
-from lpv_track_env.real_vehicle import (
-    INSTANT,
+from lpv_track_env.conditions_vehicle import (
     blow,
     command_age,
     move,
@@ -31,6 +30,7 @@ from lpv_track_env.real_vehicle import (
     serve,
     stop_acceleration,
 )
+from lpv_track_env.episodes import begin
 from trajectories.compilation import compiled, compiled_in_place, compiled_internal
 from trajectories.projection import SEARCH_WINDOW
 
@@ -40,35 +40,35 @@ Array = NDArray[Any]
 @compiled_in_place
 def take_command(m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array) -> int:
     """Begin a control period: send its command, if it can be; the bits of what was clipped."""
-    p, queue = constants, m[real.TAIL : real.ways_start(spec)]
-    filter_memory = m[real.filter_start(spec) :]
+    p, queue = constants, m[layout.TAIL : layout.ways_start(spec)]
+    filter_memory = m[layout.filter_start(spec) :]
     now = memory[k.STEPS] * p[k.PERIOD]
     bits = 0
-    if m[real.FREE_AT] > now + INSTANT:
+    if m[layout.FREE_AT] > now + layout.INSTANT:
         # The controller is still busy with an earlier command: it misses its turn.
-        m[real.MISSES] += 1.0
-        m[real.MISSED_IN_A_ROW] += 1.0
+        m[layout.MISSES] += 1.0
+        m[layout.MISSED_IN_A_ROW] += 1.0
     else:
         # Rates are limited over the time since the last command.
-        periods = 1.0 + m[real.MISSED_IN_A_ROW]
+        periods = 1.0 + m[layout.MISSED_IN_A_ROW]
         a, delta, bits = k.actuate(
-            a, delta, m[real.COMMAND_A], m[real.COMMAND_DELTA], p[k.MAX_STEERING],
+            a, delta, m[layout.COMMAND_A], m[layout.COMMAND_DELTA], p[k.MAX_STEERING],
             periods * p[k.STEERING_STEP], p[k.LOWEST_ACCELERATION], p[k.HIGHEST_ACCELERATION],
             periods * p[k.ACCELERATION_STEP],
         )  # fmt: skip
-        m[real.MISSED_IN_A_ROW] = 0.0
+        m[layout.MISSED_IN_A_ROW] = 0.0
         send(m, queue, now, a, delta, offset_of(filter_memory, spec))
-    m[real.LATENCY] = m[real.OCCUPIED] = -1.0
+    m[layout.LATENCY] = m[layout.OCCUPIED] = -1.0
     blind = (
-        spec[real.ESTIMATOR] == real.EKF
-        and filter_memory[filtering.FIX_AGE] > spec[real.MAX_FIX_AGE]
+        spec[layout.ESTIMATOR] == layout.EKF
+        and filter_memory[filtering.FIX_AGE] > spec[layout.MAX_FIX_AGE]
     )
-    stale = command_age(m, queue, now) > spec[real.MAX_COMMAND_AGE] + INSTANT
-    m[real.STOPPING] = 0.0
+    stale = command_age(m, queue, now) > spec[layout.MAX_COMMAND_AGE] + layout.INSTANT
+    m[layout.STOPPING] = 0.0
     if blind or stale:
-        m[real.STOPPING] = 1.0
+        m[layout.STOPPING] = 1.0
         # The drive goes on from where it is when commands count again: within the jerk limit.
-        m[real.COMMAND_A] = m[real.SERVO_A]
+        m[layout.COMMAND_A] = m[layout.SERVO_A]
     return bits
 
 
@@ -79,11 +79,11 @@ def end_period(
     work: Array,
 ) -> int:  # fmt: skip
     """End a control period with a new state: errors, end, reward, sensors, estimate."""
-    p, filtered = constants, real.filter_start(spec)
-    ways, filter_memory = m[real.ways_start(spec) : filtered], m[filtered:]
+    p, filtered = constants, layout.filter_start(spec)
+    ways, filter_memory = m[layout.ways_start(spec) : filtered], m[filtered:]
     end = k.finish(
-        memory, p, table, observation, vx, vy, psi, r, x, y, m[real.SERVO_A],
-        m[real.SERVO_DELTA], bits,
+        memory, p, table, observation, vx, vy, psi, r, x, y, m[layout.SERVO_A],
+        m[layout.SERVO_DELTA], bits,
     )  # fmt: skip
     if end == k.NON_FINITE:
         # What was seen last stays: there is no state that sensors could read.
@@ -98,7 +98,7 @@ def end_period(
 
 
 @compiled_in_place
-def drive_real(
+def drive_under_conditions(
     m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array, table: Array,
     observation: Array, key: Any, episode: Any, work: Array,
 ) -> int:  # fmt: skip
@@ -106,7 +106,7 @@ def drive_real(
     bits = take_command(m, memory, a, delta, spec, constants)
     period = constants[k.PERIOD]
     blow(m, key, episode, PERIOD_DRAW + DRAWS * (int(memory[k.STEPS]) + 1), period)
-    queue = m[real.TAIL : real.ways_start(spec)]
+    queue = m[layout.TAIL : layout.ways_start(spec)]
     vx, vy, psi, r, x, y = move(m, queue, memory, constants, memory[k.STEPS] * period)
     return end_period(
         m, memory, vx, vy, psi, r, x, y, bits, spec, constants, table, observation, key, episode,
@@ -119,11 +119,11 @@ def see(m: Array, constants: Array, table: Array, observation: Array, ahead: Any
     """Find the estimate on the path and make the observation of it."""
     # A fix may move the estimate by more than the vehicle drives in a period.
     window = min(max(SEARCH_WINDOW, 1.5 * abs(ahead)), constants[k.LENGTH])
-    k.look(m[real.ESTIMATE : real.TAIL], constants, table, observation, ahead, window)
+    k.look(m[layout.ESTIMATE : layout.TAIL], constants, table, observation, ahead, window)
 
 
 @compiled
-def begin_real(
+def begin_under_conditions(
     m: Array, memory: Array, spec: Array, constants: Array, table: Array, observation: Array,
     draws: Array, given: Array,
 ) -> None:  # fmt: skip
@@ -137,29 +137,29 @@ def begin_real(
         m[j] = 0.0
     draw_conditions(m, spec, key, episode)
     for j in range(7):
-        m[real.PLANT + j] = constants[j]
-    m[real.PLANT] *= m[real.MASS_FACTOR]
-    m[real.PLANT + 1] *= m[real.INERTIA_FACTOR]
-    m[real.PLANT + 4] *= m[real.FRONT_STIFFNESS_FACTOR]
-    m[real.PLANT + 5] *= m[real.REAR_STIFFNESS_FACTOR]
-    m[real.PLANT + 6] *= m[real.ROLLING_FACTOR]
-    m[real.LATENCY] = m[real.OCCUPIED] = -1.0
-    m[real.SERVO_A], m[real.SERVO_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]
-    m[real.COMMAND_A], m[real.COMMAND_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]
-    m[real.TAIL] = 0.0
-    m[real.TAIL + 1], m[real.TAIL + 2] = memory[k.ACCELERATION], memory[k.STEERING]
-    m[real.QUEUED] = 1.0
-    begin_estimate(m, m[real.filter_start(spec) :], memory, key, episode, PERIOD_DRAW, spec)
-    e = m[real.ESTIMATE : real.TAIL]
+        m[layout.PLANT + j] = constants[j]
+    m[layout.PLANT] *= m[layout.MASS_FACTOR]
+    m[layout.PLANT + 1] *= m[layout.INERTIA_FACTOR]
+    m[layout.PLANT + 4] *= m[layout.FRONT_STIFFNESS_FACTOR]
+    m[layout.PLANT + 5] *= m[layout.REAR_STIFFNESS_FACTOR]
+    m[layout.PLANT + 6] *= m[layout.ROLLING_FACTOR]
+    m[layout.LATENCY] = m[layout.OCCUPIED] = -1.0
+    m[layout.SERVO_A], m[layout.SERVO_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]
+    m[layout.COMMAND_A], m[layout.COMMAND_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]
+    m[layout.TAIL] = 0.0
+    m[layout.TAIL + 1], m[layout.TAIL + 2] = memory[k.ACCELERATION], memory[k.STEERING]
+    m[layout.QUEUED] = 1.0
+    begin_estimate(m, m[layout.filter_start(spec) :], memory, key, episode, PERIOD_DRAW, spec)
+    e = m[layout.ESTIMATE : layout.TAIL]
     e[k.ACCELERATION], e[k.STEERING] = memory[k.ACCELERATION], memory[k.STEERING]
-    if spec[real.ESTIMATOR] == real.TRUTH:
-        e[k.STEERING] += m[real.STEERING_OFFSET]
+    if spec[layout.ESTIMATOR] == layout.TRUTH:
+        e[k.STEERING] += m[layout.STEERING_OFFSET]
     e[k.ARC_LENGTH] = memory[k.ARC_LENGTH]
     see(m, constants, table, observation, 0.0)
 
 
 @compiled
-def advance_real(
+def advance_under_conditions(
     data: Array, table: Array, m: Array, spec: Array, work: Array, draws: Array
 ) -> tuple[int, Any, Any, Any, Any, int, Any, Any, Any, Any, Any, Any, Any]:
     """`kernels.advance` under conditions: one period of a single environment, in place.
@@ -169,7 +169,7 @@ def advance_real(
     a, delta = data[0], data[1]
     c = data[k.MEMORY : k.CONSTANTS]
     if math.isfinite(a) and math.isfinite(delta):
-        end = drive_real(
+        end = drive_under_conditions(
             m, c, a, delta, spec, data[k.CONSTANTS : k.OBSERVATION], table,
             data[k.OBSERVATION :].view(np.float32), draws[0], draws[1], work,
         )  # fmt: skip
@@ -183,7 +183,7 @@ def advance_real(
 
 
 @compiled
-def command_real(data: Array, m: Array, spec: Array) -> tuple[Any, Any, int]:
+def command_under_conditions(data: Array, m: Array, spec: Array) -> tuple[Any, Any, int]:
     """Begin a control period of a plant that is not the kernels' bicycle.
 
     Returns the mean acceleration that the drive gives over it (m/s^2), the angle at which the
@@ -191,20 +191,20 @@ def command_real(data: Array, m: Array, spec: Array) -> tuple[Any, Any, int]:
     """
     memory, constants = data[k.MEMORY : k.CONSTANTS], data[k.CONSTANTS : k.OBSERVATION]
     bits = take_command(m, memory, data[0], data[1], spec, constants)
-    queue = m[real.TAIL : real.ways_start(spec)]
+    queue = m[layout.TAIL : layout.ways_start(spec)]
     substeps, now = int(constants[k.SUBSTEPS]), memory[k.STEPS] * constants[k.PERIOD]
     h = constants[k.PERIOD] / substeps
     braking = stop_acceleration(m, constants)
-    m[real.MEAN_A] = m[real.MEAN_DELTA] = 0.0
+    m[layout.MEAN_A] = m[layout.MEAN_DELTA] = 0.0
     for i in range(substeps):
         a, delta = serve(m, queue, braking, now + i * h, h)
-        m[real.MEAN_A] += a / substeps
-        m[real.MEAN_DELTA] += delta / substeps
-    return m[real.MEAN_A], m[real.SERVO_DELTA] + m[real.STEERING_OFFSET], bits
+        m[layout.MEAN_A] += a / substeps
+        m[layout.MEAN_DELTA] += delta / substeps
+    return m[layout.MEAN_A], m[layout.SERVO_DELTA] + m[layout.STEERING_OFFSET], bits
 
 
 @compiled
-def conclude_real(
+def conclude_under_conditions(
     data: Array, table: Array, m: Array, spec: Array, work: Array, draws: Array, state: Array,
     bits: int,
 ) -> int:  # fmt: skip
