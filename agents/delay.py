@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents import ahead
+from agents import delay_kernels
 from agents.base import Action, Agent, DrivingTask
 from agents.reference import NODE
 from lpv_track_env.bicycle import longest_substep
@@ -48,7 +48,7 @@ class DelayCompensated:
     """An agent whose actions land later: it decides on the observation of that time.
 
     The vehicle's state is driven on by the model over computing delay, dead time and lag of the
-    steering, under the commands that are on their way (`agents.ahead`). Every agent can have it;
+    steering, under the commands that are on their way (`agents.delay_kernels`). Every agent can have it;
     what it needs to know is nominal: the delays' and lags' middles, not those of the episode.
 
     Parameters
@@ -121,13 +121,17 @@ class DelayCompensated:
         if episode_start is not None:
             starts |= np.broadcast_to(np.asarray(episode_start, dtype=bool), (n,))
         if memory is None or len(memory) != n:
-            memory = DelayMemory(None, np.zeros((n, self._kept, 2)), np.zeros((n, ahead.FOOT)))
+            memory = DelayMemory(
+                None, np.zeros((n, self._kept, 2)), np.zeros((n, delay_kernels.FOOT))
+            )
             starts[:] = True
         if state is None:
             self._memory = memory
         # Before the first command the actuators have stood where they are.
         memory.commands[starts] = np.nan_to_num(rows[starts, None, 3:5])
-        ahead.look_ahead_all(rows, memory.commands, self._settings, self._nodes, memory.feet)
+        delay_kernels.look_ahead_all(
+            rows, memory.commands, self._settings, self._nodes, memory.feet
+        )
         seen = rows[0] if given.ndim == 1 else rows
         action, memory.inner = self.agent.predict(seen, memory.inner, starts, deterministic)
         memory.commands[:, 1:] = memory.commands[:, :-1].copy()
