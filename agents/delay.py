@@ -48,8 +48,8 @@ class DelayCompensated:
     """An agent whose actions land later: it decides on the observation of that time.
 
     The vehicle's state is driven on by the model over computing delay, dead time and lag of the
-    steering, under the commands that are on their way (`agents.delay_kernels`). Every agent can have it;
-    what it needs to know is nominal: the delays' and lags' middles, not those of the episode.
+    steering, under the commands that are on their way (`agents.delay_kernels`). Every agent can
+    have it; what it needs to know is nominal: the delays' and lags' middles, not the episode's.
 
     Parameters
     ----------
