@@ -44,12 +44,70 @@ class DelayRow:
     foot: Array
 
 
+class NearFuture:
+    """Observations of n vehicles moved to the time at which their next action lands.
+
+    The vehicle's state is driven on by the model over computing delay, dead time and lag of the
+    steering, under the commands that are on their way (`agents.delay_kernels`). What it needs to
+    know is nominal: the delays' and lags' middles, not the episode's.
+
+    Parameters
+    ----------
+    task
+        What is driven.
+    actuation
+        Delays and lags, s.
+    model
+        The vehicle as the prediction knows it; by default the task's.
+    """
+
+    def __init__(
+        self, task: DrivingTask, actuation: Actuation, model: VehicleParameters | None = None
+    ) -> None:
+        vehicle = model or task.vehicle
+        drive = actuation.computing_delay + actuation.drive_dead_time
+        steering = actuation.computing_delay + actuation.steering_dead_time
+        self._settings = np.array(
+            [
+                drive,
+                actuation.drive_lag,
+                steering,
+                actuation.steering_lag,
+                steering + actuation.steering_lag,
+                drive + actuation.drive_lag,
+                task.control_period,
+                task.layout.preview_period,
+                longest_substep(vehicle),
+                *vehicle.as_array(),
+            ]
+        )
+        self._kept = math.ceil(max(drive, steering) / task.control_period) + 1
+        self._nodes = np.zeros((task.layout.preview_steps + 1, NODE))
+
+    def memory(self, n: int) -> "DelayMemory":
+        """Memory of n vehicles before their first observations."""
+        return DelayMemory(None, np.zeros((n, self._kept, 2)), np.zeros((n, delay_kernels.FOOT)))
+
+    def look(self, rows: Array, starts: NDArray[np.bool_], memory: "DelayMemory") -> None:
+        """Move observations, rows (n, size) float64, in place; `starts` (n,) begin episodes."""
+        # Before the first command the actuators have stood where they are.
+        memory.commands[starts] = np.nan_to_num(rows[starts, None, 3:5])
+        delay_kernels.look_ahead_all(
+            rows, memory.commands, self._settings, self._nodes, memory.feet
+        )
+
+    @staticmethod
+    def note(memory: "DelayMemory", actions: NDArray[Any] | None) -> None:
+        """Remember the actions (n, 2) that were sent; None: nothing was, the last ones stay."""
+        memory.commands[:, 1:] = memory.commands[:, :-1].copy()
+        if actions is not None:
+            memory.commands[:, 0] = actions
+
+
 class DelayCompensated:
     """An agent whose actions land later: it decides on the observation of that time.
 
-    The vehicle's state is driven on by the model over computing delay, dead time and lag of the
-    steering, under the commands that are on their way (`agents.delay_kernels`). Every agent can
-    have it; what it needs to know is nominal: the delays' and lags' middles, not the episode's.
+    Every agent can have it, see `NearFuture`.
 
     Parameters
     ----------
@@ -71,25 +129,7 @@ class DelayCompensated:
         model: VehicleParameters | None = None,
     ) -> None:
         self.agent, self.task, self.actuation = agent, task, actuation
-        vehicle = model or task.vehicle
-        drive = actuation.computing_delay + actuation.drive_dead_time
-        steering = actuation.computing_delay + actuation.steering_dead_time
-        self._settings = np.array(
-            [
-                drive,
-                actuation.drive_lag,
-                steering,
-                actuation.steering_lag,
-                steering + actuation.steering_lag,
-                drive + actuation.drive_lag,
-                task.control_period,
-                task.layout.preview_period,
-                longest_substep(vehicle),
-                *vehicle.as_array(),
-            ]
-        )
-        self._kept = math.ceil(max(drive, steering) / task.control_period) + 1
-        self._nodes = np.zeros((task.layout.preview_steps + 1, NODE))
+        self._future = NearFuture(task, actuation, model)
         self._memory: DelayMemory | None = None
 
     def __getattr__(self, name: str) -> Any:
@@ -121,28 +161,21 @@ class DelayCompensated:
         if episode_start is not None:
             starts |= np.broadcast_to(np.asarray(episode_start, dtype=bool), (n,))
         if memory is None or len(memory) != n:
-            memory = DelayMemory(
-                None, np.zeros((n, self._kept, 2)), np.zeros((n, delay_kernels.FOOT))
-            )
+            memory = self._future.memory(n)
             starts[:] = True
         if state is None:
             self._memory = memory
-        # Before the first command the actuators have stood where they are.
-        memory.commands[starts] = np.nan_to_num(rows[starts, None, 3:5])
-        delay_kernels.look_ahead_all(
-            rows, memory.commands, self._settings, self._nodes, memory.feet
-        )
+        self._future.look(rows, starts, memory)
         seen = rows[0] if given.ndim == 1 else rows
         action, memory.inner = self.agent.predict(seen, memory.inner, starts, deterministic)
-        memory.commands[:, 1:] = memory.commands[:, :-1].copy()
-        memory.commands[:, 0] = np.atleast_2d(action)
+        self._future.note(memory, np.atleast_2d(action))
         return action, memory
 
     def hold(self, memory: DelayMemory | None = None) -> None:
         """Let a control period pass in which nothing was computed: the last command stays."""
         held = self._memory if memory is None else memory
         if held is not None:
-            held.commands[:, 1:] = held.commands[:, :-1].copy()
+            self._future.note(held, None)
 
     def diagnostics(self, memory: DelayRow) -> dict[str, Any]:
         """What the agent tells of its last step, its plan moved to where it belongs."""
