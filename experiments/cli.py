@@ -206,6 +206,12 @@ def _run_parallel(options: argparse.Namespace, console: Any) -> int:
     return command.run_parallel(setup, options.out, console)
 
 
+def _train(options: argparse.Namespace, console: Any) -> int:
+    from experiments.training.command import run_training
+
+    return run_training(options, console)
+
+
 RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "benchmark": _benchmark,
     "report": _report,
@@ -217,6 +223,7 @@ RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "verify": _verify,
     "bag": _bag,
     "run-parallel": _run_parallel,
+    "train": _train,
 }
 """What runs each command."""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from experiments.bags.arguments import add_bag_parsers
 from experiments.parallel.options import add_parallel_options
+from experiments.training.options import add_training_options
 
 Add = Callable[[str, str, str], argparse.ArgumentParser]
 """Makes the parser of a command from its name, what it does, and an example."""
@@ -190,6 +191,16 @@ def _run_parallel(add: Add) -> None:
     )
 
 
+def _train(add: Add) -> None:
+    add_training_options(
+        add(
+            "train",
+            "Train a policy that drives, on random paths under randomised conditions.",
+            "lpv-track train ppo --seed 0 --hours 0.1 --out results/ppo",
+        )
+    )
+
+
 def parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     root = argparse.ArgumentParser(
@@ -220,6 +231,7 @@ def parser() -> argparse.ArgumentParser:
         _verify,
         _bag,
         _run_parallel,
+        _train,
     ):
         declare(add)
     return root

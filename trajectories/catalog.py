@@ -3,7 +3,7 @@
 import difflib
 import math
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -111,7 +111,7 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
     if name in ANALYTIC:
         return _analytic(name)
     if name.startswith("random-") and name[7:].isdecimal():
-        return random_path(int(name[7:]))
+        return _random(int(name[7:]))
     if name.endswith(".csv") or Path(name).is_file():
         from trajectories.files import read
 
@@ -121,6 +121,11 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
         f"unknown trajectory {name!r}; known: {', '.join(names())} and any other random-SEED "
         f"(nearest: {nearest}), or give a .csv file"
     )
+
+
+@lru_cache(maxsize=256)
+def _random(seed: int) -> ReferencePath:
+    return random_path(seed)
 
 
 def limits_of(rows: PathStatistics) -> SpeedLimits:

@@ -1,0 +1,49 @@
+"""Checkpoints: plain values and tensors, written atomically, read without unpickling objects."""
+
+import io
+import pickle
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from trajectories.atomic import write_atomically
+
+FORMAT = "lpv-track-checkpoint/1"
+NAME = "checkpoint.pt"
+
+
+def write(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write a folder's checkpoint, in place of the last one."""
+    buffer = io.BytesIO()
+    torch.save({"format": FORMAT, **content}, buffer)
+    write_atomically(folder / NAME, buffer.getvalue())
+
+
+def read(folder: Path) -> dict[str, Any] | None:
+    """Read a folder's checkpoint; None where there is none.
+
+    Raises
+    ------
+    ValueError
+        If it is damaged, of another version, or holds anything but tensors and plain values.
+    """
+    file = folder / NAME
+    if not file.exists():
+        return None
+    try:
+        content: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
+        if content["format"] != FORMAT:
+            raise ValueError(f"its format is {content['format']!r}, not {FORMAT!r}")
+    except (
+        pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError, OSError,
+        zipfile.BadZipFile,
+    ) as error:  # fmt: skip
+        # torch's own text is many lines long and advises to load it unsafely.
+        reason = error if isinstance(error, ValueError) else type(error).__name__
+        raise ValueError(
+            f"{file} cannot be read ({reason}): remove it, and the training begins anew"
+        ) from None
+    return content

@@ -1,0 +1,150 @@
+"""Behaviour cloning of `lpv-nmpc` with DAgger (Ross, Gordon, Bagnell 2011).
+
+Round by round the environments are driven, some by the expert and the others by the policy as it
+is; the expert says at every step what it would do; and the network is fitted to all that it ever
+said, by least squares. Hyperparameters (`--set`): `learning_rate`, `last_learning_rate`; `round`
+steps of every environment, then `updates` of Adam with `batch` samples each; `expert_share` of the
+environments that the expert drives (all, in the first round), with uniform `noise` in [-1, 1] on
+what half of each drive; `hidden`, `activation`, `origin` as for PPO.
+"""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.logger import Logger
+
+from agents.learned.learner import LearnerVecEnv
+from agents.learned.policy import Policy
+from agents.nmpc.rti_agent import RtiNmpc
+from experiments.training.settings import TrainingSettings
+from experiments.training.start import check_start, put_layers
+from experiments.training.trainer import Tick, Trainer
+
+ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
+Array = NDArray[Any]
+
+
+class CloningTrainer(Trainer):
+    """Rounds of driving, asking and fitting."""
+
+    def __init__(
+        self, settings: TrainingSettings, env: LearnerVecEnv, start: Policy | None, logger: Logger
+    ) -> None:
+        super().__init__(settings, env)
+        self._logger = logger
+        torch.manual_seed(settings.seed)
+        widths = [env.scaling.features, *self.hyper["hidden"], 2]
+        self._linear = [torch.nn.Linear(a, b) for a, b in pairwise(widths)]
+        parts: list[torch.nn.Module] = []
+        for layer in self._linear:
+            parts += [layer, ACTIVATIONS[self.hyper["activation"]]()]
+        self._net = torch.nn.Sequential(*parts[:-1])
+        if start is not None:
+            check_start(start, settings, env.scaling, squash="clip")
+            put_layers(start.layers, self._linear)
+        self._optimiser = torch.optim.Adam(self._net.parameters(), lr=self.rate_of(0))
+        self._expert = RtiNmpc(env.task)
+        self._asked = np.zeros((0, env.scaling.features), dtype=np.float32)
+        self._said = np.zeros((0, 2), dtype=np.float32)
+
+    def rate_of(self, steps: int) -> float:
+        """Learning rate after so many steps."""
+        first, last = self.hyper["learning_rate"], self.hyper["last_learning_rate"]
+        return float(first + min(steps / self.settings.steps, 1.0) * (last - first))
+
+    @property
+    def steps(self) -> int:
+        """Steps driven, each of them with the expert's answer."""
+        return len(self._asked)
+
+    @property
+    def solves(self) -> int:
+        """The expert's answers."""
+        return len(self._asked)
+
+    def segment(self, number: int, tick: Tick) -> dict[str, float]:
+        """Rounds up to the end of a segment."""
+        self.begin_segment(number)
+        loss = 0.0
+        while self.steps < self.settings.of_segment(number):
+            self._drive()
+            loss = self._fit()
+            self._logger.record("train/loss", loss)
+            self._logger.record("train/learning_rate", self.rate())
+            self._logger.dump(self.steps)
+            tick(self.steps, f"loss {loss:.2e}")
+        return {"loss": loss}
+
+    def _drive(self) -> None:
+        """One round: every environment begins anew and is driven for `round` steps."""
+        n = self.env.num_envs
+        features = self.env.reset()
+        memory, starts = None, np.ones(n, dtype=np.bool_)
+        by_expert = self.random.random(n) < (1.0 if not self.steps else self.hyper["expert_share"])
+        noise = self.hyper["noise"] * (self.random.random(n) < 0.5)
+        asked, said = [self._asked], [self._said]
+        for _ in range(self.hyper["round"]):
+            actions, memory = self._expert.predict(self.env.shown, memory, starts)
+            scaling = self.env.scaling
+            wanted = (actions - self.env.origins - scaling.centre) / scaling.half
+            wanted = np.clip(wanted, -1.0, 1.0).astype(np.float32)
+            asked.append(features)
+            said.append(wanted)
+            outputs = np.where(by_expert[:, None], wanted, self._outputs(features))
+            outputs += noise[:, None] * self.random.uniform(-1.0, 1.0, outputs.shape)
+            features, _, starts, _ = self.env.step(outputs)
+        self._asked, self._said = np.concatenate(asked), np.concatenate(said)
+
+    def _outputs(self, features: Array) -> Array:
+        with torch.no_grad():
+            outputs: Array = self._net(torch.from_numpy(features)).numpy()
+        return outputs
+
+    def _fit(self) -> float:
+        """Adam on samples of everything said so far; the mean loss of the last tenth."""
+        for group in self._optimiser.param_groups:
+            group["lr"] = self.rate()
+        inputs, targets = torch.from_numpy(self._asked), torch.from_numpy(self._said)
+        updates, losses = self.hyper["updates"], []
+        for _ in range(updates):
+            rows = torch.randint(len(inputs), (self.hyper["batch"],))
+            loss = torch.nn.functional.mse_loss(self._net(inputs[rows]), targets[rows])
+            self._optimiser.zero_grad()
+            loss.backward()
+            self._optimiser.step()
+            losses.append(loss.item())
+        return float(np.mean(losses[-max(updates // 10, 1) :]))
+
+    def state(self) -> dict[str, Any]:
+        """Network, optimiser, and all that was asked and said."""
+        return {
+            "network": self._net.state_dict(),
+            "optimiser": self._optimiser.state_dict(),
+            "asked": torch.from_numpy(self._asked),
+            "said": torch.from_numpy(self._said),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take a state back."""
+        self._net.load_state_dict(state["network"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._asked, self._said = state["asked"].numpy(), state["said"].numpy()
+
+    def policy(self, training: Mapping[str, Any]) -> Policy:
+        """The policy as it is."""
+        scaling = self.env.scaling
+        layers = tuple(
+            (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
+            for layer in self._linear
+        )
+        return Policy(
+            algorithm=self.settings.algorithm, layout=self.env.task.layout,
+            control_period=self.settings.control_period, layers=layers,
+            activation=self.hyper["activation"], squash="clip", training=training,
+            **{item.name: getattr(scaling, item.name) for item in fields(scaling)},
+        )  # fmt: skip

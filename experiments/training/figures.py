@@ -1,0 +1,37 @@
+"""The picture of a training: what validation said as it went on."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments.figures import COLOURS
+from trajectories.atomic import write_atomically
+
+
+def draw(lines: Sequence[dict[str, Any]], file: Path) -> None:
+    """Draw ALE and steering of the validation drives over steps and seconds."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    steps = [line["steps"] for line in lines]
+    for axes, key, label in (
+        (left, "mean_ale", "ALE m, mean of validation drives"),
+        (right, "mean_steering_variation", "steering variation rad, mean"),
+    ):
+        values = [line["validation"][key] for line in lines]
+        axes.plot(steps, values, color=COLOURS[0], marker=".")
+        best = [k for k, line in enumerate(lines) if line["best"]][-1]
+        axes.plot(steps[best], values[best], "o", color=COLOURS[1], label="kept")
+        axes.set(xlabel="steps", ylabel=label)
+        axes.grid(alpha=0.3)
+        if min(values) > 0.0 and max(values) > 5.0 * min(values):
+            axes.set_yscale("log")
+    left.legend()
+    figure.suptitle(f"{lines[-1]['seconds']:.0f} s, {lines[-1]['solves']:,} NMPC solves")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    write_atomically(file, buffer.getvalue())

@@ -1,0 +1,185 @@
+"""Everything that determines a training, and the defaults of each algorithm."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any
+
+from experiments.suites import SIX
+from lpv_track_env import conditions, vehicle
+from lpv_track_env.naming import choose
+from lpv_track_env.reward import RewardWeights
+
+PPO = {
+    "learning_rate": 1e-3, "last_learning_rate": 2e-5, "rollout": 32, "batch": 4096, "epochs": 4,
+    "discount": 0.97, "gae_lambda": 0.9, "clip_range": 0.2, "deviation": math.exp(-1.0),
+    "hidden": [64, 64], "activation": "tanh", "origin": "actuators",
+}  # fmt: skip
+OFF_POLICY = {
+    "learning_rate": 1e-3, "last_learning_rate": 2e-5, "buffer": 300_000, "batch": 512,
+    "gradient_steps": 16, "learning_starts": 10_000, "discount": 0.97, "target_rate": 0.01,
+    "hidden": [64, 64], "activation": "relu", "origin": "actuators",
+}  # fmt: skip
+
+HYPERPARAMETERS: dict[str, dict[str, Any]] = {
+    "ppo": PPO,
+    "residual": {**PPO, "deviation": math.exp(-2.0), "origin": "lpv-nmpc"},
+    "sac": OFF_POLICY,
+    "td3": {**OFF_POLICY, "noise": 0.2},
+    "bc": {
+        "learning_rate": 2e-3, "last_learning_rate": 1e-5, "round": 100, "batch": 4096,
+        "updates": 600, "expert_share": 0.25, "noise": 0.3,
+        "hidden": [64, 64], "activation": "tanh", "origin": "actuators",
+    },
+}  # fmt: skip
+"""What `--set` may change, by algorithm, with its defaults; see `sb3_trainer` and `cloning`."""
+
+ENVS = {"ppo": 512, "residual": 256, "sac": 64, "td3": 64, "bc": 256}
+STEPS = {
+    "ppo": 20_000_000, "residual": 3_000_000, "sac": 1_500_000, "td3": 1_500_000, "bc": 1_500_000,
+}  # fmt: skip
+SEGMENTS = {
+    "ppo": 1_000_000, "residual": 250_000, "sac": 100_000, "td3": 100_000, "bc": 100_000,
+}  # fmt: skip
+ALGORITHMS = tuple(HYPERPARAMETERS)
+
+FAST = {
+    "conditions": ("simulation",), "envs": 1024, "steps": 5_000_000,
+    "hyperparameters": {"batch": 16_384, "epochs": 2},
+}  # fmt: skip
+"""`--fast` of PPO: perfect knowledge only, and few, large updates."""
+
+REWARD = {
+    "lateral_scale": 0.1, "heading": 0.25, "speed_scale": 0.5, "input_rate": 0.2,
+}  # fmt: skip
+"""Of `RewardWeights`, in training: the environment's own scale of 0.5 m is too wide for it."""
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """A training: the same settings give the same weights, bit for bit, on the same machine.
+
+    `steps` are environment steps of all environments together; every `segment` of them a
+    checkpoint is written, seeds are set anew from (seed, segment) and all episodes begin anew, so
+    that a training that goes on from a checkpoint is the one that was not interrupted. `conditions`
+    share the environments evenly. `trajectories` are files or names; by default `paths` random
+    ones that only this seed trains on. `start` is a policy file whose network is the first one.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name, a number out of its range, or a path of the benchmark's six.
+    """
+
+    algorithm: str
+    steps: int
+    envs: int
+    segment: int
+    seed: int = 0
+    vehicle: str = "m2-minibus"
+    conditions: tuple[Any, ...] = ("simulation", "realtime")
+    control_period: float = 0.05
+    preview_steps: int = 20
+    preview_period: float | None = None
+    trajectories: tuple[str, ...] = ()
+    paths: int = 64
+    time_limit: float = 20.0
+    start: str | None = None
+    device: str = "auto"
+    reward: Mapping[str, float] = field(default_factory=lambda: dict(REWARD))
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        known = HYPERPARAMETERS[choose("algorithm", self.algorithm, ALGORITHMS)]
+        given = dict(self.hyperparameters)
+        for key, value in given.items():
+            choose(f"hyperparameter of {self.algorithm}", key, tuple(known))
+            _check_kind(key, value, known[key])
+        object.__setattr__(self, "hyperparameters", {**known, **given})
+        object.__setattr__(self, "conditions", tuple(self.conditions))
+        object.__setattr__(self, "trajectories", tuple(self.trajectories))
+        for name in ("steps", "envs", "segment", "paths"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not 0 <= self.seed < 1000:
+            raise ValueError(f"seed must be in [0, 999], not {self.seed}")
+        if not self.conditions:
+            raise ValueError("a training needs at least one kind of conditions")
+        if self.envs < len(self.conditions):
+            raise ValueError(f"{len(self.conditions)} conditions need as many environments")
+        for given_conditions in self.conditions:
+            conditions.load(given_conditions)
+        for name in self.trajectories:
+            if name.removesuffix("-raw") in SIX:
+                raise ValueError(f"{name} is for evaluation: train on other paths")
+        vehicle.load(self.vehicle)
+        self.reward_weights()
+
+    def reward_weights(self) -> RewardWeights:
+        """Reward that the training maximises."""
+        for key in self.reward:
+            choose("reward weight", key, tuple(item.name for item in fields(RewardWeights)))
+        return RewardWeights(**self.reward)
+
+    @property
+    def segments(self) -> int:
+        """Number of segments."""
+        return math.ceil(self.steps / self.segment)
+
+    def of_segment(self, number: int) -> int:
+        """Steps that a segment is to end at."""
+        return min((number + 1) * self.segment, self.steps)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as JSON gives them back."""
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return plain
+
+
+def usual(algorithm: str, **changes: Any) -> TrainingSettings:
+    """Settings of an algorithm with some changed; None changes nothing.
+
+    Raises
+    ------
+    ValueError
+        For an unknown algorithm, or as `TrainingSettings`.
+    """
+    choose("algorithm", algorithm, ALGORITHMS)
+    given = {key: value for key, value in changes.items() if value is not None}
+    steps = given.get("steps", STEPS[algorithm])
+    usual_values = {
+        "steps": steps, "envs": ENVS[algorithm], "segment": min(SEGMENTS[algorithm], max(steps, 1)),
+    }  # fmt: skip
+    return TrainingSettings(algorithm, **{**usual_values, **given})
+
+
+def with_steps(settings: TrainingSettings, steps: int) -> TrainingSettings:
+    """Return the same training over so many steps."""
+    return replace(settings, steps=steps, segment=min(settings.segment, steps))
+
+
+def difference(settings: TrainingSettings, stored: Mapping[str, Any]) -> str | None:
+    """What differs between settings and stored ones, in words; None: nothing."""
+    for key, value in settings.as_dict().items():
+        if stored.get(key) != value:
+            return f"{key} is {value!r}, there {stored.get(key)!r}"
+    return None
+
+
+def _check_kind(key: str, value: Any, usual_value: Any) -> None:
+    """Refuse a hyperparameter of another kind than its default, or no sensible number."""
+    if isinstance(usual_value, str):
+        good = isinstance(value, str)
+    elif isinstance(usual_value, list):
+        good = (
+            isinstance(value, list)
+            and bool(value)
+            and all(type(width) is int and 0 < width <= 4096 for width in value)
+        )
+    elif isinstance(usual_value, int):
+        good = type(value) is int and value > 0
+    else:
+        good = type(value) in {int, float} and math.isfinite(value) and value >= 0.0
+    if not good:
+        raise ValueError(f"hyperparameter {key} must be like {usual_value!r}, not {value!r}")

@@ -1,0 +1,62 @@
+"""How good a policy is on paths that it does not train on, by the benchmark's own cases."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.cases import Case, run_case
+from experiments.training.environments import VALIDATION_PATHS
+from experiments.training.settings import TrainingSettings
+
+PATHS = 6
+"""Validation paths for each kind of conditions."""
+
+
+def cases(settings: TrainingSettings, policy: Path, paths: int = PATHS) -> list[dict[str, Any]]:
+    """Cases of a validation."""
+    return [
+        Case(
+            agent=str(policy),
+            trajectory=f"random-{VALIDATION_PATHS + k}",
+            vehicle=settings.vehicle,
+            conditions=kind,
+            seed=k,
+            control_period=settings.control_period,
+            env_settings={
+                "preview_steps": settings.preview_steps,
+                "preview_period": settings.preview_period,
+            },
+        ).as_dict()
+        for kind in settings.conditions
+        for k in range(paths)
+    ]
+
+
+def validate(settings: TrainingSettings, policy: Path, paths: int = PATHS) -> dict[str, float]:
+    """Drive the validation cases: share that finished, ALE and MLE (m), steering.
+
+    `loss`, by which the best policy is chosen, is the mean ALE, an unfinished drive counting as if
+    it had been at the corridor's edge.
+
+    Raises
+    ------
+    ValueError
+        If a case could not be run.
+    """
+    results = [run_case(case) for case in cases(settings, policy, paths)]
+    for result in results:
+        if result["status"] != "ok":
+            raise ValueError(f"validation on {result['trajectory']}: {result['error']}")
+    finished = np.array([result["end"] == "finished" for result in results])
+    ale = np.array([result["metrics"]["ale"] for result in results])
+    edge = 5.0
+    return {
+        "loss": float(np.where(finished, ale, edge).mean()),
+        "finished": float(finished.mean()),
+        "mean_ale": float(ale.mean()),
+        "worst_mle": float(max(result["metrics"]["mle"] for result in results)),
+        "mean_steering_variation": float(
+            np.mean([result["metrics"]["steering_variation"] for result in results])
+        ),
+    }
