@@ -206,6 +206,12 @@ def _run_parallel(options: argparse.Namespace, console: Any) -> int:
     return command.run_parallel(setup, options.out, console)
 
 
+def _import_policy(options: argparse.Namespace, console: Any) -> int:
+    from experiments.policy_import import run_import
+
+    return run_import(options, console)
+
+
 RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "benchmark": _benchmark,
     "report": _report,
@@ -217,6 +223,7 @@ RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "verify": _verify,
     "bag": _bag,
     "run-parallel": _run_parallel,
+    "import-policy": _import_policy,
 }
 """What runs each command."""
 
