@@ -59,6 +59,13 @@ class DrivingTask:
     actuation: Actuation = NOTHING_DELAYED
     """Delays and lags between a command and its effect, nominal (s)."""
 
+    @property
+    def action_bounds(self) -> tuple[Action, Action]:
+        """The action space's own float32 bounds, (2,): an action clipped to them lies in it."""
+        low, high = self.vehicle.acceleration_range
+        limit = self.vehicle.max_steering_angle
+        return np.array([low, -limit], np.float32), np.array([high, limit], np.float32)
+
     @classmethod
     def of(cls, env: gymnasium.Env[Any, Any]) -> "DrivingTask":
         """Read it off an environment (wrapped or not).
@@ -87,6 +94,39 @@ def stopping_acceleration(vehicle: VehicleParameters, speed: float) -> float:
     return command
 
 
+def blind_control(
+    vehicle: VehicleParameters, observation: TrackingObservation
+) -> tuple[float, float]:
+    """Inputs (m/s^2, rad) for an observation that is not finite: steering held, braking to a stop.
+
+    Its speed and its steering angle count where they are finite.
+    """
+    speed, steering = float(observation.longitudinal_speed), float(observation.steering_angle)
+    return (
+        stopping_acceleration(vehicle, speed),
+        steering if math.isfinite(steering) else 0.0,
+    )
+
+
+def observation_rows(observation: NDArray[Any], size: int) -> NDArray[np.float64]:
+    """One observation (size,), or a batch (n, size), as rows (n, size) for compiled code: a copy.
+
+    Raises
+    ------
+    ValueError
+        If it has another size.
+    """
+    rows = np.array(observation, dtype=np.float64, order="C")
+    if rows.ndim == 1:
+        rows = rows.reshape(1, -1)
+    if rows.ndim != 2 or rows.shape[1] != size:
+        raise ValueError(
+            f"observation has shape {np.shape(observation)}, this layout has {size} "
+            "entries, alone or in rows: make the agent for this environment"
+        )
+    return rows
+
+
 class TrackingAgent(ABC, Generic[Memory]):
     """An agent made from `control`, which drives one vehicle on one observation.
 
@@ -96,11 +136,7 @@ class TrackingAgent(ABC, Generic[Memory]):
 
     def __init__(self, task: DrivingTask) -> None:
         self.task = task
-        low, high = task.vehicle.acceleration_range
-        limit = task.vehicle.max_steering_angle
-        # The action space's own float32 bounds, so that a clipped action lies in the space.
-        self._low = np.array([low, -limit], dtype=np.float32)
-        self._high = np.array([high, limit], dtype=np.float32)
+        self._low, self._high = task.action_bounds
         self._memories: list[Memory] = []
 
     @abstractmethod
@@ -116,11 +152,7 @@ class TrackingAgent(ABC, Generic[Memory]):
 
         The memory is left alone: one NaN in an integral would stay there for good.
         """
-        speed, steering = float(observation.longitudinal_speed), float(observation.steering_angle)
-        return (
-            stopping_acceleration(self.task.vehicle, speed),
-            steering if math.isfinite(steering) else 0.0,
-        )
+        return blind_control(self.task.vehicle, observation)
 
     @abstractmethod
     def new_memory(self) -> Memory:

@@ -5,7 +5,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -27,6 +27,12 @@ REGISTRY: dict[str, str] = {
 """Name -> "module:Class"; the class takes a `DrivingTask` and its own keyword settings."""
 
 
+CHECKPOINTS = Path(__file__).parent / "checkpoints"
+"""Folder of the learned policies that come with this project: NAME.json for the agent NAME."""
+
+POLICY_FILES = (".json", ".safetensors", ".zip")
+"""How the name of a learned policy's file ends; of the last two it is said what to give instead."""
+
 COMMON = ("delay_compensation",)
 """Settings that `make` itself takes, for every agent."""
 
@@ -36,25 +42,31 @@ def names() -> list[str]:
     return list(REGISTRY)
 
 
-def agent_class(name: str) -> type[Any]:
+def agent_class(name: str) -> Callable[..., Any]:
     """Class behind a name, or behind a "module:Class" or "file.py:Class" of the user's own.
+
+    For the .json of a learned policy, what makes its agent.
 
     Raises
     ------
     ValueError
-        For an unknown name; the message lists the known ones and the nearest.
+        For an unknown name, with the known ones and the nearest; or a file that cannot be used.
     """
+    if name.endswith(POLICY_FILES):
+        from agents.learned.agent import of_file
+
+        return of_file(name)
     target = REGISTRY.get(name, name)
     module, separator, attribute = target.rpartition(":")
     if not separator:
         nearest = difflib.get_close_matches(name, REGISTRY, n=1, cutoff=0.0)[0]
         raise ValueError(
             f"unknown agent {name!r}; known: {', '.join(REGISTRY)} (nearest: {nearest}), "
-            "or give your own as file.py:Class or module:Class"
+            "or give your own as file.py:Class or module:Class, a learned policy as its .json"
         )
     try:
         if module.endswith(".py"):
-            found: type[Any] = getattr(_module_of(Path(module).resolve()), attribute)
+            found: Callable[..., Any] = getattr(_module_of(Path(module).resolve()), attribute)
         else:
             found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, OSError, SyntaxError) as error:
@@ -76,9 +88,18 @@ def _module_of(file: Path) -> ModuleType:
 
 
 def source_file(name: str) -> Path | None:
-    """File of a user's own agent, whose contents belong to a result; None for registered names."""
+    """File whose contents belong to a result, beside this project's sources; None if there is none.
+
+    That of a user's own agent, or of a learned policy, a shipped one too: its digest of the weights
+    stands for these.
+    """
+    if name.endswith(".json"):
+        return Path(name)
+    if name in REGISTRY:
+        shipped = CHECKPOINTS / f"{name}.json"
+        return shipped if shipped.is_file() else None
     module, separator, _ = name.rpartition(":")
-    if name in REGISTRY or not separator:
+    if not separator:
         return None
     if module.endswith(".py"):
         return Path(module)
@@ -124,7 +145,7 @@ def make(
     Parameters
     ----------
     name
-        As `names` lists it, or "module:Class" or "file.py:Class".
+        As `names` lists it, or "module:Class", "file.py:Class", or the .json of a learned policy.
     env
         What it will drive, wrapped or not.
     delay_compensation

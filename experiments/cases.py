@@ -68,7 +68,13 @@ class Case:
     @property
     def id(self) -> str:
         """Hash of the case, the files it names and the project's sources: none changes unseen."""
-        named = (Path(self.trajectory), Path(self.vehicle), source_file(self.agent))
+        # A setting that names a .json, such as a learned policy's.
+        settings = (
+            Path(value)
+            for value in self.agent_settings.values()
+            if isinstance(value, str) and value.endswith(".json")
+        )
+        named = (Path(self.trajectory), Path(self.vehicle), source_file(self.agent), *settings)
         files = [
             hashlib.sha256(file.read_bytes()).hexdigest()
             for file in named

@@ -212,6 +212,12 @@ def _train(options: argparse.Namespace, console: Any) -> int:
     return run_training(options, console)
 
 
+def _import_policy(options: argparse.Namespace, console: Any) -> int:
+    from experiments.policy_import import run_import
+
+    return run_import(options, console)
+
+
 RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "benchmark": _benchmark,
     "report": _report,
@@ -224,6 +230,7 @@ RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "bag": _bag,
     "run-parallel": _run_parallel,
     "train": _train,
+    "import-policy": _import_policy,
 }
 """What runs each command."""
 

@@ -25,7 +25,10 @@ def _benchmark(add: Add) -> None:
         help="paper (default), quick, realtime, plants, converged, sideslip or frozen",
     )
     benchmark.add_argument(
-        "--agents", nargs="+", metavar="NAME", help="default: all; your own: file.py:Class"
+        "--agents",
+        nargs="+",
+        metavar="NAME",
+        help="default: all; your own: file.py:Class, policy.json",
     )
     benchmark.add_argument(
         "--trajectories", nargs="+", metavar="NAME", help="instead of a suite's: names or files"
@@ -201,6 +204,31 @@ def _train(add: Add) -> None:
     )
 
 
+def _import_policy(add: Add) -> None:
+    command = add(
+        "import-policy",
+        "Take the policy out of a model that Stable-Baselines3 has saved. The model must have been "
+        "trained on lpv_track_env/PathTracking-v0, observations as they come, actions in SI units "
+        "or behind gymnasium.wrappers.RescaleAction(env, -1, 1).",
+        "lpv-track import-policy model.zip --algorithm ppo --trust --out mine.json",
+    )
+    command.add_argument("model", type=Path, metavar="MODEL.zip", help="what model.save() wrote")
+    command.add_argument("--algorithm", required=True, choices=["ppo", "sac", "td3"])
+    command.add_argument(
+        "--trust", action="store_true",
+        help="load it, although loading such a file runs whatever code it holds",
+    )  # fmt: skip
+    command.add_argument("--out", type=Path, required=True, metavar="NAME.json")
+    command.add_argument(
+        "--vehicle", default="m2-minibus", metavar="NAME", help="driven in training"
+    )
+    command.add_argument("--control-period", type=float, default=0.05, metavar="S")
+    command.add_argument("--preview-steps", type=int, default=20, metavar="K")
+    command.add_argument(
+        "--preview-period", type=float, metavar="S", help="default: the control period"
+    )
+
+
 def parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     root = argparse.ArgumentParser(
@@ -232,6 +260,7 @@ def parser() -> argparse.ArgumentParser:
         _bag,
         _run_parallel,
         _train,
+        _import_policy,
     ):
         declare(add)
     return root

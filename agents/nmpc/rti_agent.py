@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.base import Action, DrivingTask
+from agents.base import Action, DrivingTask, observation_rows
 from agents.nmpc import layout, program, rti
 from agents.nmpc.base import Ladder, NmpcAgent
 from agents.nmpc.problem import INPUTS, STATES
@@ -187,15 +187,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         ValueError
             If the observation does not have this agent's layout.
         """
-        rows = np.array(observation, dtype=np.float64, order="C")
-        single = rows.ndim == 1
-        if single:
-            rows = rows.reshape(1, -1)
-        if rows.ndim != 2 or rows.shape[1] != self._size:
-            raise ValueError(
-                f"observation has shape {np.shape(observation)}, this layout has {self._size} "
-                "entries, alone or in rows: make the agent for this environment"
-            )
+        rows = observation_rows(observation, self._size)
         n = rows.shape[0]
         memory = self._memory if state is None else state
         if memory is None or len(memory) != n:
@@ -214,7 +206,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
                 rows, memory, np.flatnonzero(memory.told[:, program.CODE] != program.SUCCESS)
             )
         actions = memory.actions.astype(np.float32)
-        return (actions[0] if single else actions), memory
+        return (actions[0] if np.ndim(observation) == 1 else actions), memory
 
     def _control(self, rows: Array, weights: Array, memory: RtiMemory) -> int:
         """Solve for every row; how many solves failed."""

@@ -187,4 +187,3 @@ class Sb3Trainer(Trainer):
             algorithm=self.settings.algorithm, training=training,
             **{item.name: getattr(scaling, item.name) for item in fields(scaling)},
         )  # fmt: skip
-

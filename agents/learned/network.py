@@ -1,0 +1,162 @@
+"""A policy's features and network, compiled: rows of observations to actions.
+
+Every row is worked out alone and in the same order, so its action does not depend on the batch.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.learned.policy import ORIGINS, Policy
+from lpv_track_env.observation import SCALARS
+from trajectories.compilation import compiled, compiled_inline
+
+Array = NDArray[Any]
+
+FROM_ACTUATORS, FROM_BASE = ORIGINS.index("actuators"), ORIGINS.index("lpv-nmpc")
+IN_FORCE_A, IN_FORCE_DELTA = (
+    [name for name, _, _ in SCALARS].index(entry) for entry in ("acceleration", "steering_angle")
+)
+
+START, INPUTS, OUTPUTS, BEND = range(4)
+"""Of a layer in `table`: where its transposed weights (inputs, outputs) begin in `weights`, its
+bias following; what is done to its outputs."""
+
+BENDS = ("tanh", "relu", "clip")
+TANH, RELU, CLIP = range(3)
+
+# Of `numbers`, (9,): the features' limit; a and delta of each.
+LIMIT, CENTRE, HALF, LOW, HIGH = 0, 1, 3, 5, 7
+
+
+@compiled_inline
+def dense(x: Array, layer: Array, weights: Array, y: Array) -> None:
+    """Fill y = W x + b; the inner loops run over outputs, side by side in memory."""
+    inputs, outputs = layer[INPUTS], layer[OUTPUTS]
+    at = layer[START]
+    bias = weights[at + inputs * outputs : at + inputs * outputs + outputs]
+    for j in range(outputs):
+        y[j] = bias[j]
+    blocks = inputs // 4
+    # Four inputs at a time, so that y is loaded and stored a quarter as often.
+    for block in range(blocks):
+        i = 4 * block
+        x0, x1, x2, x3 = x[i], x[i + 1], x[i + 2], x[i + 3]
+        w0 = weights[at + i * outputs : at + (i + 1) * outputs]
+        w1 = weights[at + (i + 1) * outputs : at + (i + 2) * outputs]
+        w2 = weights[at + (i + 2) * outputs : at + (i + 3) * outputs]
+        w3 = weights[at + (i + 3) * outputs : at + (i + 4) * outputs]
+        for j in range(outputs):
+            y[j] = (((y[j] + x0 * w0[j]) + x1 * w1[j]) + x2 * w2[j]) + x3 * w3[j]
+    for i in range(4 * blocks, inputs):
+        x0 = x[i]
+        w0 = weights[at + i * outputs : at + (i + 1) * outputs]
+        for j in range(outputs):
+            y[j] += x0 * w0[j]
+
+
+@compiled_inline
+def bend(y: Array, outputs: int, kind: int, limit: Any) -> None:
+    """Apply tanh, relu, or clip to [-limit, limit]; what is no number stays none."""
+    zero = np.float32(0.0)
+    if kind == TANH:
+        for j in range(outputs):
+            y[j] = math.tanh(y[j])
+    elif kind == RELU:
+        for j in range(outputs):
+            y[j] = zero if y[j] < zero else y[j]  # noqa: FURB136  max() may drop a NaN
+    else:
+        for j in range(outputs):
+            low = -limit if y[j] < -limit else y[j]  # noqa: FURB136
+            y[j] = limit if low > limit else low  # noqa: FURB136
+
+
+@compiled
+def act(
+    rows: Array, weights: Array, table: Array, numbers: Array, origin: int, scratch: Array,
+    actions: Array,
+) -> int:  # fmt: skip
+    """Put an action in the place of each row's base action; how many rows have none.
+
+    Parameters
+    ----------
+    rows
+        (n, size) float64 observations.
+    weights, table
+        All weights and biases, float32; (1 + layers, 4) int64, the features first.
+    numbers
+        Limit, centre, half, low and high, float64.
+    origin
+        Index in `ORIGINS`.
+    scratch
+        (2, widest) float32.
+    actions
+        (n, 2) float64: read for origin "lpv-nmpc", then written; NaN where the row is not finite
+        or the network makes no number of it.
+    """
+    size, lost = rows.shape[1], 0
+    for row in range(rows.shape[0]):
+        x, y = scratch[0], scratch[1]
+        finite = True
+        for i in range(size):
+            x[i] = np.float32(rows[row, i])
+            finite = finite and math.isfinite(x[i])
+        base_a, base_delta = 0.0, 0.0
+        if origin == FROM_ACTUATORS:
+            base_a, base_delta = rows[row, IN_FORCE_A], rows[row, IN_FORCE_DELTA]
+        elif origin == FROM_BASE:
+            base_a, base_delta = actions[row, 0], actions[row, 1]
+            x[size], x[size + 1] = np.float32(base_a), np.float32(base_delta)
+        limit = np.float32(numbers[LIMIT])
+        for k in range(table.shape[0]):
+            layer = table[k]
+            dense(x, layer, weights, y)
+            bend(y, layer[OUTPUTS], layer[BEND], limit)
+            limit = np.float32(1.0)
+            x, y = y, x
+        a = base_a + numbers[CENTRE] + numbers[HALF] * x[0]
+        delta = base_delta + numbers[CENTRE + 1] + numbers[HALF + 1] * x[1]
+        if finite and not (math.isnan(a) or math.isnan(delta)):
+            actions[row, 0] = min(max(a, numbers[LOW]), numbers[HIGH])
+            actions[row, 1] = min(max(delta, numbers[LOW + 1]), numbers[HIGH + 1])
+        else:
+            actions[row, 0] = actions[row, 1] = math.nan
+            lost += 1
+    return lost
+
+
+@dataclass(eq=False)
+class Network:
+    """A policy as `act` takes it."""
+
+    weights: NDArray[np.float32]
+    table: NDArray[np.int64]
+    numbers: NDArray[np.float64]
+    origin: int
+    scratch: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, policy: Policy, low: Array, high: Array) -> "Network":
+        """Pack a policy's numbers, with the bounds (2,) of actions in SI units."""
+        stages = [(policy.feature_weight, policy.feature_bias), *policy.layers]
+        bends = ["clip", *[policy.activation] * (len(policy.layers) - 1), policy.squash]
+        table, packed, start = [], [], 0
+        for (weight, bias), kind in zip(stages, bends, strict=True):
+            table.append([start, weight.shape[1], weight.shape[0], BENDS.index(kind)])
+            packed += [weight.T.ravel(), bias]
+            start += weight.size + bias.size
+        numbers = np.concatenate([[policy.feature_limit], policy.centre, policy.half, low, high])
+        return cls(
+            np.concatenate(packed),
+            np.array(table, dtype=np.int64),
+            numbers,
+            ORIGINS.index(policy.origin),
+            np.zeros((2, max(policy.sizes)), dtype=np.float32),
+        )
+
+    def act(self, rows: Array, actions: Array) -> int:
+        """Actions (n, 2) of rows (n, size), see `act`; how many rows have none."""
+        return act(rows, self.weights, self.table, self.numbers, self.origin, self.scratch, actions)

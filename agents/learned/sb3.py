@@ -1,0 +1,166 @@
+"""Policies out of models of Stable-Baselines3: PPO, SAC and TD3 with an MLP on flat observations.
+
+The only file of this package that imports torch and SB3, on use.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agents.learned.policy import Activation, Layer, Origin, Policy, Squash
+from lpv_track_env.naming import choose
+from lpv_track_env.observation import ObservationLayout
+
+ALGORITHMS = ("ppo", "sac", "td3")
+ACTIVATIONS: dict[str, Activation] = {"Tanh": "tanh", "ReLU": "relu"}
+"""Of torch's classes."""
+
+
+def from_sb3(
+    model: Any,
+    *,
+    layout: ObservationLayout,
+    control_period: float,
+    algorithm: str,
+    feature_weight: ArrayLike,
+    feature_bias: ArrayLike,
+    feature_limit: float,
+    origin: Origin,
+    centre: ArrayLike,
+    half: ArrayLike,
+    training: Mapping[str, Any],
+) -> Policy:
+    """Take the deterministic policy out of a model of SB3.
+
+    The model maps features to its own action space; that space's range, whatever it is, becomes
+    u in [-1, 1], so `centre` and `half` say what the ends of that range mean in SI units.
+
+    Parameters
+    ----------
+    model
+        PPO, SAC or TD3 (or another algorithm with the same policy class), "MlpPolicy".
+    layout, control_period, algorithm, feature_weight, feature_bias, feature_limit, origin, centre, half, training
+        Of the `Policy`; the features are what the model was shown, worked out outside of it.
+
+    Raises
+    ------
+    ValueError
+        For a policy that is not such a network, with the reason; or see `Policy`.
+    """  # noqa: E501
+    modules, squash = _network(model.policy)
+    layers, activation = _layers(modules)
+    low, high = _range(model.action_space)
+    if squash == "clip":
+        # Such a model is trained on the action itself, which is clipped to the space outside.
+        middle, reach = 0.5 * (low + high), 0.5 * (high - low)
+        weight, bias = layers[-1]
+        layers[-1] = (
+            (weight / reach[:, None]).astype(np.float32),
+            ((bias - middle) / reach).astype(np.float32),
+        )
+    return Policy(
+        algorithm=algorithm,
+        layout=layout,
+        control_period=control_period,
+        feature_weight=feature_weight,  # type: ignore[arg-type]
+        feature_bias=feature_bias,  # type: ignore[arg-type]
+        feature_limit=feature_limit,
+        layers=tuple(layers),
+        activation=activation,
+        squash=squash,
+        origin=origin,
+        centre=centre,  # type: ignore[arg-type]
+        half=half,  # type: ignore[arg-type]
+        training=training,
+    )
+
+
+def load_trusted(file: Path, algorithm: str) -> Any:
+    """Load a .zip of SB3, on the CPU. This runs whatever code the file holds.
+
+    Raises
+    ------
+    ValueError
+        If it is not a model of that algorithm.
+    ModuleNotFoundError
+        If SB3 is not installed.
+    """
+    choose("algorithm", algorithm, ALGORITHMS)
+    if not file.is_file():
+        raise ValueError(f"there is no file {file}: give the .zip that model.save() has written")
+    try:
+        import stable_baselines3
+    except ModuleNotFoundError as error:
+        if error.name not in {"stable_baselines3", "torch"}:
+            raise
+        raise ModuleNotFoundError(
+            "Stable-Baselines3 is not installed: pip install 'lpv-track-env[rl]'", name=error.name
+        ) from error
+    kind = getattr(stable_baselines3, algorithm.upper())
+    try:
+        return kind.load(file, device="cpu")
+    except Exception as error:  # what a file may raise that is something else, nobody knows
+        raise ValueError(
+            f"{file} is not a model that {algorithm.upper()} of Stable-Baselines3 loads: "
+            f"{type(error).__name__}: {error}"
+        ) from error
+
+
+def _network(policy: Any) -> tuple[list[Any], Squash]:
+    """Modules from features to the deterministic action, in order, and what follows them."""
+    from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.common.torch_layers import FlattenExtractor
+    from stable_baselines3.sac.policies import SACPolicy
+    from stable_baselines3.td3.policies import TD3Policy
+
+    kind = type(policy)
+    squash: Squash = "tanh"
+    if kind is ActorCriticPolicy:
+        extractor = policy.pi_features_extractor
+        modules = [*policy.mlp_extractor.policy_net, policy.action_net]
+        squash = "clip"
+    elif kind is SACPolicy:
+        extractor = policy.actor.features_extractor
+        modules = [*policy.actor.latent_pi, policy.actor.mu]
+    elif kind is TD3Policy:
+        extractor = policy.actor.features_extractor
+        # Its last module is the tanh.
+        modules = list(policy.actor.mu)[:-1]
+    else:
+        raise ValueError(f"{kind.__name__} cannot be taken: only MlpPolicy of PPO, SAC and TD3 can")
+    if type(extractor) is not FlattenExtractor:
+        raise ValueError(f"{type(extractor).__name__} cannot be taken: train with FlattenExtractor")
+    if getattr(policy, "use_sde", False) or getattr(policy, "actor_kwargs", {}).get("use_sde"):
+        raise ValueError("generalised exploration cannot be taken: train with use_sde=False")
+    return modules, squash
+
+
+def _layers(modules: list[Any]) -> tuple[list[Layer], Activation]:
+    """Weights and biases of linear modules with one activation between them."""
+    from torch import nn
+
+    linear, between = modules[::2], modules[1::2]
+    kinds = {type(module).__name__ for module in between}
+    if not all(type(module) is nn.Linear for module in linear) or not kinds <= ACTIVATIONS.keys():
+        told = ", ".join(type(module).__name__ for module in modules)
+        raise ValueError(f"{told} cannot be taken: only linear layers with Tanh or ReLU between")
+    if len(kinds) > 1:
+        raise ValueError("layers with different activations cannot be taken")
+    layers: list[Layer] = [
+        (
+            module.weight.detach().cpu().numpy().copy(),
+            module.bias.detach().cpu().numpy().copy(),
+        )
+        for module in linear
+    ]
+    return layers, ACTIVATIONS[kinds.pop()] if kinds else "tanh"
+
+
+def _range(space: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    low, high = getattr(space, "low", None), getattr(space, "high", None)
+    if low is None or high is None or not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise ValueError(f"action space {space} cannot be taken: it must be a bounded Box")
+    return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
