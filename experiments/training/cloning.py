@@ -83,11 +83,12 @@ class CloningTrainer(Trainer):
     def _drive(self) -> None:
         """One round: every environment begins anew and is driven for `round` steps."""
         n = self.env.num_envs
-        features = self.env.reset()
+        features: Array = self.env.reset()
         memory, starts = None, np.ones(n, dtype=np.bool_)
         by_expert = self.random.random(n) < (1.0 if not self.steps else self.hyper["expert_share"])
         noise = self.hyper["noise"] * (self.random.random(n) < 0.5)
-        asked, said = [self._asked], [self._said]
+        asked: list[Array] = [self._asked]
+        said: list[Array] = [self._said]
         for _ in range(self.hyper["round"]):
             actions, memory = self._expert.predict(self.env.shown, memory, starts)
             scaling = self.env.scaling
@@ -97,7 +98,8 @@ class CloningTrainer(Trainer):
             said.append(wanted)
             outputs = np.where(by_expert[:, None], wanted, self._outputs(features))
             outputs += noise[:, None] * self.random.uniform(-1.0, 1.0, outputs.shape)
-            features, _, starts, _ = self.env.step(outputs)
+            self.env.step_async(outputs)
+            features, _, starts, _ = self.env.step_wait()
         self._asked, self._said = np.concatenate(asked), np.concatenate(said)
 
     def _outputs(self, features: Array) -> Array:
@@ -115,7 +117,7 @@ class CloningTrainer(Trainer):
             rows = torch.randint(len(inputs), (self.hyper["batch"],))
             loss = torch.nn.functional.mse_loss(self._net(inputs[rows]), targets[rows])
             self._optimiser.zero_grad()
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             self._optimiser.step()
             losses.append(loss.item())
         return float(np.mean(losses[-max(updates // 10, 1) :]))

@@ -14,7 +14,7 @@ SAC (Haarnoja et al. 2018) and TD3 (Fujimoto et al. 2018): `buffer` transitions,
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -142,7 +142,7 @@ class Sb3Trainer(Trainer):
         if not isinstance(self.model, PPO):
             return []
         own = [p for layer in self._actor_layers() for p in layer.parameters()]
-        return [*own, cast("torch.nn.Parameter", self.model.policy.log_std)]
+        return [*own, self.model.policy.log_std]
 
     def state(self) -> dict[str, Any]:
         """Networks, optimisers, counters, and of SAC and TD3 the replay buffer."""

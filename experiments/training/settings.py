@@ -44,7 +44,7 @@ SEGMENTS = {
 }  # fmt: skip
 ALGORITHMS = tuple(HYPERPARAMETERS)
 
-FAST = {
+FAST: dict[str, Any] = {
     "conditions": ("simulation",), "envs": 1024, "steps": 5_000_000,
     "hyperparameters": {"batch": 16_384, "epochs": 2},
 }  # fmt: skip
