@@ -120,16 +120,23 @@ def test_closed_names() -> None:
     assert {name for name in EVERY if load(name).closed} == {"circle", "figure-eight"}
 
 
-@given(st.integers(0, 2**63))
-@settings(max_examples=15, deadline=None)
-def test_random_paths_are_drivable(seed: int) -> None:
-    path = load(f"random-{seed}")
-    check_contract(path, f"random-{seed}")
+@pytest.mark.parametrize(
+    ("kind", "shortest", "longest", "fastest"),
+    [("random", 300.0, 900.0, 14.0), ("random-fast", 600.0, 1700.0, 18.0)],
+)
+@given(seed=st.integers(0, 2**63))
+@settings(max_examples=10, deadline=None)
+def test_random_paths_are_drivable(
+    kind: str, shortest: float, longest: float, fastest: float, seed: int
+) -> None:
+    path = load(f"{kind}-{seed}")
+    check_contract(path, f"{kind}-{seed}")
     assert np.abs(path.curvature).max() < STEERABLE
     limits = path.metadata["limits"]
     lateral = path.speed**2 * np.abs(path.curvature)
     assert lateral.max() <= 1.005 * limits["max_lateral_acceleration"]
-    assert 300.0 < path.length < 900.0
+    assert shortest < path.length < longest
+    assert path.speed.max() <= 1.005 * limits["max_speed"] <= 1.005 * fastest
 
 
 def test_random_paths_repeat_with_their_seed_and_differ_without() -> None:

@@ -89,8 +89,10 @@ SHAPE_LIMITS = SpeedLimits(
 
 
 def names() -> list[str]:
-    """Names that `load` knows, each of which loads; every random-SEED with an integer >= 0 does."""
-    return [*PUBLISHED, *(f"{name}-raw" for name in PUBLISHED), *ANALYTIC, "random-0"]
+    """Names that `load` knows, each of which loads; so do random-SEED and random-fast-SEED >= 0."""
+    return [
+        *PUBLISHED, *(f"{name}-raw" for name in PUBLISHED), *ANALYTIC, "random-0", "random-fast-0",
+    ]  # fmt: skip
 
 
 def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
@@ -110,22 +112,23 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
         return _raw(name[:-4])
     if name in ANALYTIC:
         return _analytic(name)
-    if name.startswith("random-") and name[7:].isdecimal():
-        return _random(int(name[7:]))
+    kind, _, seed = name.rpartition("-")
+    if kind in {"random", "random-fast"} and seed.isdecimal():
+        return _random(int(seed), kind == "random-fast")
     if name.endswith(".csv") or Path(name).is_file():
         from trajectories.files import read
 
         return read(Path(name))
     nearest = difflib.get_close_matches(name, names(), n=1, cutoff=0.0)[0]
     raise ValueError(
-        f"unknown trajectory {name!r}; known: {', '.join(names())} and any other random-SEED "
+        f"unknown trajectory {name!r}; known: {', '.join(names())} and both with any other seed "
         f"(nearest: {nearest}), or give a .csv file"
     )
 
 
 @lru_cache(maxsize=256)
-def _random(seed: int) -> ReferencePath:
-    return random_path(seed)
+def _random(seed: int, fast: bool) -> ReferencePath:
+    return random_path(seed, fast=fast)
 
 
 def limits_of(rows: PathStatistics) -> SpeedLimits:
@@ -310,31 +313,40 @@ def _double_lane_change(t: Array) -> shapes.Derivatives:
     return t, y, np.ones_like(t), dy, np.zeros_like(t), ddy
 
 
-def random_path(seed: int | np.random.Generator, *, length: float | None = None) -> ReferencePath:
+def random_path(
+    seed: int | np.random.Generator, *, length: float | None = None, fast: bool = False
+) -> ReferencePath:
     """Draw a drivable path: turns of 9 to 60 m radius between straights, for training.
 
-    The same seed gives the same path. Speed limits are drawn too: 6 to 14 m/s, 1.0 to 2.0 m/s^2
-    laterally, 1.3 to 2.0 m/s^2 longitudinally. `length` (m) is drawn from 300 to 600 unless given.
+    The same seed gives the same path. Speed limits are drawn too: 6 to 14 m/s (`fast`: 10 to 18),
+    1.0 to 2.0 m/s^2 laterally, 1.3 to 2.0 m/s^2 longitudinally. Straights are 8 to 120 m long
+    (`fast`: 40 to 400), `length` (m) is drawn from 300 to 600 (`fast`: 600 to 1000) unless given.
     """
+    alone = isinstance(seed, np.random.Generator)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
-    name = "random" if isinstance(seed, np.random.Generator) else f"random-{seed}"
+    kind = "random-fast" if fast else "random"
+    speeds, straights, lengths = (
+        ((10.0, 18.0), (40.0, 400.0), (600.0, 1000.0))
+        if fast
+        else ((6.0, 14.0), (8.0, 120.0), (300.0, 600.0))
+    )
     limits = SpeedLimits(
-        max_speed=float(rng.uniform(6.0, 14.0)),
+        max_speed=float(rng.uniform(*speeds)),
         max_lateral_acceleration=float(rng.uniform(1.0, 2.0)),
         max_acceleration=float(rng.uniform(1.3, 2.0)),
     )
-    wanted = float(rng.uniform(300.0, 600.0)) if length is None else length
+    wanted = float(rng.uniform(*lengths)) if length is None else length
     segments = [shapes.Segment(length=float(rng.uniform(20.0, 50.0)))]
     planned = segments[0].length
     while planned < wanted:
         radius = float(np.exp(rng.uniform(np.log(9.0), np.log(60.0))))
         angle = math.radians(float(rng.uniform(20.0, 110.0 if radius > 12.0 else 95.0)))
         turn = shapes.Segment(turn=float(rng.choice([-1.0, 1.0])) * angle, radius=radius)
-        straight = shapes.Segment(length=float(np.exp(rng.uniform(np.log(8.0), np.log(120.0)))))
+        straight = shapes.Segment(length=float(np.exp(rng.uniform(*np.log(straights)))))
         segments += [turn, straight]
         planned = sum(part.length for part in shapes.fit(segments, limits))
     return from_geometry(
-        shapes.build(shapes.fit(segments, limits)), limits, name,
-        source=f"random segments, seed {seed}" if name != "random" else "random segments",
+        shapes.build(shapes.fit(segments, limits)), limits, kind if alone else f"{kind}-{seed}",
+        source=f"{kind} segments" if alone else f"{kind} segments, seed {seed}",
         generator=GENERATOR,
     )  # fmt: skip

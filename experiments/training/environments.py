@@ -11,8 +11,8 @@ from lpv_track_env import vehicle
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import ReferencePath
 
-TRAINING_PATHS, VALIDATION_PATHS, HELD_OUT_PATHS = 10_000_000, 20_000_000, 30_000_000
-"""Seeds of random paths from here on are for training, for validation, and for neither."""
+TRAINING_PATHS, VALIDATION_PATHS = 10_000_000, 20_000_000
+"""Seeds of random paths from here on are training's and validation's; all below are neither's."""
 PATHS_OF_A_SEED = 1000
 TRAINING_EPISODES = 10**9
 """Seeds of episodes from here on are training's; evaluation counts from 0."""
@@ -23,13 +23,12 @@ def path_names(settings: TrainingSettings) -> list[str]:
     """Names of the paths of a training."""
     if settings.trajectories:
         return list(settings.trajectories)
-    first = TRAINING_PATHS + PATHS_OF_A_SEED * settings.seed
-    return [f"random-{first + k}" for k in range(settings.paths)]
+    return random_names(TRAINING_PATHS + PATHS_OF_A_SEED * settings.seed, settings.paths)
 
 
-def held_out(count: int) -> list[str]:
-    """Names of random paths that neither training nor validation has seen."""
-    return [f"random-{HELD_OUT_PATHS + k}" for k in range(count)]
+def random_names(first: int, count: int) -> list[str]:
+    """Names of random paths with seeds from `first` on, slow and fast ones in turn."""
+    return [f"random-{'fast-' * (k % 2)}{first + k}" for k in range(count)]
 
 
 def episode_seed(settings: TrainingSettings, segment: int) -> int:

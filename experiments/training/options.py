@@ -35,7 +35,7 @@ def add_training_options(train: argparse.ArgumentParser) -> None:
     train.add_argument(
         "--trajectories", nargs="+", metavar="NAME", help="own paths in place of random ones"
     )
-    train.add_argument("--paths", type=int, metavar="N", help="random paths (default 64)")
+    train.add_argument("--paths", type=int, metavar="N", help="random paths (default 48)")
     train.add_argument("--envs", type=int, metavar="N", help="environments side by side")
     train.add_argument("--segment", type=int, metavar="N", help="steps between checkpoints")
     train.add_argument(

@@ -51,7 +51,7 @@ FAST: dict[str, Any] = {
 """`--fast` of PPO: perfect knowledge only, and few, large updates."""
 
 REWARD = {
-    "lateral_scale": 0.1, "heading": 0.25, "speed_scale": 0.5, "input_rate": 0.2,
+    "lateral_scale": 0.05, "heading": 0.1, "speed_scale": 0.5, "input_rate": 0.2,
 }  # fmt: skip
 """Of `RewardWeights`, in training: the environment's own scale of 0.5 m is too wide for it."""
 
@@ -64,7 +64,8 @@ class TrainingSettings:
     checkpoint is written, seeds are set anew from (seed, segment) and all episodes begin anew, so
     that a training that goes on from a checkpoint is the one that was not interrupted. `conditions`
     share the environments evenly. `trajectories` are files or names; by default `paths` random
-    ones that only this seed trains on. `start` is a policy file whose network is the first one.
+    ones that only this seed trains on. `validation` paths are
+    driven after every segment under each kind of conditions. `start` is a policy file whose network is the first one.
 
     Raises
     ------
@@ -83,7 +84,8 @@ class TrainingSettings:
     preview_steps: int = 20
     preview_period: float | None = None
     trajectories: tuple[str, ...] = ()
-    paths: int = 64
+    paths: int = 48
+    validation: int = 6
     time_limit: float = 20.0
     start: str | None = None
     device: str = "auto"
@@ -99,7 +101,7 @@ class TrainingSettings:
         object.__setattr__(self, "hyperparameters", {**known, **given})
         object.__setattr__(self, "conditions", tuple(self.conditions))
         object.__setattr__(self, "trajectories", tuple(self.trajectories))
-        for name in ("steps", "envs", "segment", "paths"):
+        for name in ("steps", "envs", "segment", "paths", "validation"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 0 <= self.seed < 1000:

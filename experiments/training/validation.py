@@ -6,19 +6,19 @@ from typing import Any
 import numpy as np
 
 from experiments.cases import Case, run_case
-from experiments.training.environments import VALIDATION_PATHS
+from experiments.training.environments import VALIDATION_PATHS, random_names
 from experiments.training.settings import TrainingSettings
 
-PATHS = 6
-"""Validation paths for each kind of conditions."""
+EDGE = 5.0
+"""m, the corridor's edge: what an unfinished drive counts for."""
 
 
-def cases(settings: TrainingSettings, policy: Path, paths: int = PATHS) -> list[dict[str, Any]]:
+def cases(settings: TrainingSettings, policy: Path) -> list[dict[str, Any]]:
     """Cases of a validation."""
     return [
         Case(
             agent=str(policy),
-            trajectory=f"random-{VALIDATION_PATHS + k}",
+            trajectory=name,
             vehicle=settings.vehicle,
             conditions=kind,
             seed=k,
@@ -29,11 +29,11 @@ def cases(settings: TrainingSettings, policy: Path, paths: int = PATHS) -> list[
             },
         ).as_dict()
         for kind in settings.conditions
-        for k in range(paths)
+        for k, name in enumerate(random_names(VALIDATION_PATHS, settings.validation))
     ]
 
 
-def validate(settings: TrainingSettings, policy: Path, paths: int = PATHS) -> dict[str, float]:
+def validate(settings: TrainingSettings, policy: Path) -> dict[str, float]:
     """Drive the validation cases: share that finished, ALE and MLE (m), steering.
 
     `loss`, by which the best policy is chosen, is the mean ALE, an unfinished drive counting as if
@@ -44,15 +44,14 @@ def validate(settings: TrainingSettings, policy: Path, paths: int = PATHS) -> di
     ValueError
         If a case could not be run.
     """
-    results = [run_case(case) for case in cases(settings, policy, paths)]
+    results = [run_case(case) for case in cases(settings, policy)]
     for result in results:
         if result["status"] != "ok":
             raise ValueError(f"validation on {result['trajectory']}: {result['error']}")
     finished = np.array([result["end"] == "finished" for result in results])
     ale = np.array([result["metrics"]["ale"] for result in results])
-    edge = 5.0
     return {
-        "loss": float(np.where(finished, ale, edge).mean()),
+        "loss": float(np.where(finished, ale, EDGE).mean()),
         "finished": float(finished.mean()),
         "mean_ale": float(ale.mean()),
         "worst_mle": float(max(result["metrics"]["mle"] for result in results)),
