@@ -95,11 +95,11 @@ def train(
     folder.mkdir(parents=True, exist_ok=True)
     if has_training(folder) and (differs := difference(settings, stored_settings(folder))):
         raise ValueError(f"{folder} holds a training with other settings: {differs}")
-    _write_json(folder / SETTINGS, settings.as_dict())
     kept = checkpoint.read(folder)
     paths = load_paths(settings, listener.loading)
     logger = configure(str(folder / "tensorboard"), ["tensorboard"])
     trainer = make_trainer(settings, paths, logger)
+    _write_json(folder / SETTINGS, settings.as_dict())
     lines: list[dict[str, Any]] = []
     if kept is not None:
         trainer.restore(kept["trainer"])

@@ -64,8 +64,8 @@ class TrainingSettings:
     checkpoint is written, seeds are set anew from (seed, segment) and all episodes begin anew, so
     that a training that goes on from a checkpoint is the one that was not interrupted. `conditions`
     share the environments evenly. `trajectories` are files or names; by default `paths` random
-    ones that only this seed trains on. `validation` paths are
-    driven after every segment under each kind of conditions. `start` is a policy file whose network is the first one.
+    ones that only this seed trains on. `validation` paths are driven after every segment under
+    each kind of conditions. `start` is a policy file whose network is the first one.
 
     Raises
     ------
