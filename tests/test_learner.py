@@ -109,7 +109,7 @@ def test_several_kinds_of_conditions_stand_one_after_another() -> None:
         np.testing.assert_array_equal(rewards, np.concatenate([part[1] for part in apart]))
         np.testing.assert_array_equal(dones, np.concatenate([part[2] for part in apart]))
     assert learner.get_attr("control_period") == [0.05] * 5
-    assert learner.env_method("render", indices=[0]) == [None]
+    assert learner.env_is_wrapped(gymnasium.Wrapper) == [False] * 5
     assert learner.num_envs == 5
 
 

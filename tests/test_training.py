@@ -196,6 +196,8 @@ def test_ppo_learns_to_drive_from_nothing(tmp_path: Path) -> None:
 def test_a_training_starts_from_a_policy_and_does_not_lose_it_at_once(tmp_path: Path) -> None:
     start = trained_clone(tmp_path / "clone")
     settings = tiny("ppo", start=str(start))
+    other_layers = {"hidden": [64], **TINY["ppo"]["hyperparameters"]}
+    zero = {"origin": "zero", **TINY["ppo"]["hyperparameters"]}
     trainer = make_trainer(settings, load_paths(settings), Logger(None, []))
     before = read_policy(start)
     for (weight, bias), (given, offset) in zip(
@@ -208,8 +210,8 @@ def test_a_training_starts_from_a_policy_and_does_not_lose_it_at_once(tmp_path: 
     trainer.segment(1, silent)
     assert (trainer.policy({}).layers[0][0] != before.layers[0][0]).any()
     for changes, said in (
-        ({"hyperparameters": {"hidden": [64]}}, "hidden layers"),
-        ({"hyperparameters": {"origin": "zero"}}, "origin of actions"),
+        ({"hyperparameters": other_layers}, "hidden layers"),
+        ({"hyperparameters": zero}, "origin of actions"),
         ({"vehicle": "course-car"}, "features or range"),
     ):
         other = tiny("ppo", start=str(start), **changes)
@@ -233,10 +235,8 @@ class Payload:
 
 
 def test_a_checkpoint_that_would_run_code_is_refused(tmp_path: Path) -> None:
-    marker = tmp_path / "ran"
-    torch.save(
-        {"format": checkpoint.FORMAT, "trainer": Payload(marker)}, tmp_path / "checkpoint.pt"
-    )
+    marker, file = tmp_path / "ran", tmp_path / "checkpoint.pt"
+    torch.save({"format": checkpoint.FORMAT, "trainer": Payload(marker)}, file)
     with pytest.raises(ValueError, match="cannot be read") as caught:
         checkpoint.read(tmp_path)
     assert "\n" not in str(caught.value)
