@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from stable_baselines3.common.monitor import Monitor
 
 import agents
 import lpv_track_env  # noqa: F401  registers the environments
@@ -109,7 +110,8 @@ def test_several_kinds_of_conditions_stand_one_after_another() -> None:
         np.testing.assert_array_equal(rewards, np.concatenate([part[1] for part in apart]))
         np.testing.assert_array_equal(dones, np.concatenate([part[2] for part in apart]))
     assert learner.get_attr("control_period") == [0.05] * 5
-    assert learner.env_is_wrapped(gymnasium.Wrapper) == [False] * 5
+    assert learner.env_is_wrapped(Monitor) == [True] * 5
+    assert learner.env_is_wrapped(gymnasium.wrappers.RescaleAction) == [False] * 5
     assert learner.num_envs == 5
 
 

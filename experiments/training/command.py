@@ -139,10 +139,10 @@ def run_training(options: argparse.Namespace, console: Console) -> int:
         return 130
     last = lines[-1]
     draw(lines, folder / "training.png")
-    rate = last["steps"] / last["seconds"]
     console.print(
-        f"{last['steps']:,} steps in {last['seconds']:.0f} s with validation ({rate:,.0f} a second)"
-        f", {last['solves']:,} NMPC solves; policy: {folder / POLICY}",
+        f"{last['steps']:,} steps in {last['seconds']:.0f} s, {last['learning_seconds']:.0f} s of "
+        f"them learning ({last['steps'] / last['learning_seconds']:,.0f} steps a second), "
+        f"{last['solves']:,} NMPC solves; policy: {folder / POLICY}",
         markup=False, highlight=False, soft_wrap=True,
     )  # fmt: skip
     return 0

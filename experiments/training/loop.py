@@ -105,17 +105,20 @@ def train(
         trainer.restore(kept["trainer"])
         lines = kept["lines"]
     _write_lines(folder, lines)
-    before = lines[-1]["seconds"] if lines else 0.0
+    before, learned = (lines[-1][key] if lines else 0.0 for key in ("seconds", "learning_seconds"))
     began = time.perf_counter()
     with Interrupts() as interrupts:
         for number in range(len(lines), settings.segments):
+            started = time.perf_counter()
             figures = trainer.segment(number, listener.step)
+            learned += time.perf_counter() - started
             interrupts.check()
             line = _judge(trainer, folder, lines, {
                 "segment": number,
                 "steps": trainer.steps,
                 "solves": trainer.solves,
                 "seconds": before + time.perf_counter() - began,
+                "learning_seconds": learned,
                 **figures,
             }, command)  # fmt: skip
             interrupts.check()
