@@ -1,15 +1,18 @@
 """Policies with random weights, for tests of their files and of the agents that run them."""
 
 import dataclasses
+import functools
 import itertools
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.learned import Policy
+from agents.learned import Policy, write
 from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.vehicle import VEHICLES
 
 TRAINING: dict[str, Any] = {
     "command": "lpv-track train ppo", "seed": 3, "steps": 1000, "conditions": {"gnss_noise": 0.05},
@@ -45,8 +48,6 @@ def random_policy(seed: int = 0, hidden: tuple[int, ...] = (16, 8), **changes: A
 
 
 def written(folder: Path, policy: Policy | None = None, name: str = "mine.json") -> Path:
-    from agents.learned import write
-
     file = folder / name
     write(policy or random_policy(), file)
     return file
@@ -84,3 +85,58 @@ def plain_act(policy: Policy, rows: NDArray[Any], base: NDArray[Any]) -> NDArray
     x = x @ weight.T.astype(np.float64) + bias
     u = np.tanh(x) if policy.squash == "tanh" else np.clip(x, -1.0, 1.0)
     return base + policy.centre + policy.half * u
+
+
+# Policies that drive `m2-minibus`: feedback written down as a network.
+
+DRIVING = ("linear", "increments", "residual")
+"""Names that `driving_file` knows."""
+
+
+@functools.cache
+def driving_file(name: str) -> Path:
+    """File of one of `DRIVING`, for this process."""
+    return written(Path(_folder().name), driving_policy(name), f"{name}.json")
+
+
+@functools.cache
+def _folder() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="lpv-track-tests-")
+
+
+def driving_policy(name: str) -> Policy:
+    """Feedback on speed, lateral and heading error with the curvature ahead; mirror-symmetric.
+
+    "linear" commands it, "increments" what it is from the actuators' values in force; "residual"
+    adds a little of it to what the NMPC commands.
+    """
+    layout, car = ObservationLayout(), VEHICLES["m2-minibus"]
+    at = {key: place.start for key, place in layout.slices.items()}
+    inputs = layout.size + (2 if name == "residual" else 0)
+    weight, bias = np.zeros((2, inputs)), np.zeros(2)
+    ahead = at["preview_speed"] + 4
+    weight[0, [ahead, at["longitudinal_speed"]]] = 1.5, -1.5
+    weight[1, [at["lateral_error"], at["heading_error"], at["yaw_rate"]]] = -0.3, -1.0, -0.1
+    scale = np.array([3.0, 0.5])
+    if name == "residual":
+        weight *= 0.02
+        weight[1, -1] = 0.01  # a hundredth more than the NMPC steers
+    else:
+        bias[0] = car.rolling_deceleration
+        weight[1, at["preview_curvature"] : at["preview_curvature"] + 8] = car.wheelbase / 8.0
+    if name == "increments":
+        weight[0, at["acceleration"]] = weight[1, at["steering_angle"]] = -1.0
+    return Policy(
+        algorithm=name,
+        layout=layout,
+        control_period=0.05,
+        feature_weight=weight.astype(np.float32),
+        feature_bias=bias.astype(np.float32),
+        feature_limit=100.0,
+        layers=((np.diag(1.0 / scale).astype(np.float32), np.zeros(2, dtype=np.float32)),),
+        activation="tanh",
+        squash="tanh" if name == "residual" else "clip",
+        origin={"linear": "zero", "increments": "actuators", "residual": "lpv-nmpc"}[name],  # type: ignore[arg-type]
+        centre=np.zeros(2),
+        half=scale,
+    )
