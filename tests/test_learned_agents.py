@@ -203,6 +203,11 @@ def test_another_preview_is_refused_with_what_to_do() -> None:
     )
 
 
+def test_both_at_once_are_told_at_once() -> None:
+    with pytest.raises(ValueError, match=r"with .*preview_period=0\.05, control_period=0\.05, or"):
+        agents.make(str(driving_file("linear")), environment(control_period=0.02))
+
+
 def test_another_control_period_is_refused_with_what_to_do() -> None:
     with pytest.raises(
         ValueError,
