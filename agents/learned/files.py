@@ -102,11 +102,12 @@ def read(file: str | Path) -> Policy:
     file = Path(file)
     _check_suffix(file)
     spec = _spec(file)
+    layout = _layout(file, spec["layout"])
     tensors = _weights(file, spec["weights"])
     try:
         return Policy(
             algorithm=spec["algorithm"],
-            layout=_layout(spec["layout"]),
+            layout=layout,
             control_period=spec["control_period"],
             feature_weight=tensors["features.weight"],
             feature_bias=tensors["features.bias"],
@@ -203,10 +204,6 @@ def _spec(file: Path) -> Spec:
         raise ValueError(
             f"{file} was changed since it was written: copy it anew, or write the policy again"
         )
-    try:
-        _layout(spec["layout"])
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
     return spec
 
 
@@ -230,12 +227,17 @@ def _layout_spec(layout: ObservationLayout) -> Spec:
     }
 
 
-def _layout(spec: Spec) -> ObservationLayout:
+def _layout(file: Path, spec: Spec) -> ObservationLayout:
     """The layout of a spec, if this version's entries are those that the policy was made for."""
     steps, period = spec["preview_steps"], spec["preview_period"]
     if type(steps) is not int or type(period) is not float:
-        raise ValueError("layout.preview_steps must be an integer, preview_period a number of s")
-    layout = ObservationLayout(steps, period)
+        raise ValueError(
+            f"{file}: layout.preview_steps must be an integer, preview_period a number of s"
+        )
+    try:
+        layout = ObservationLayout(steps, period)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
     if spec == _layout_spec(layout):
         return layout
     before, now = spec["entries"], _layout_spec(layout)["entries"]
@@ -246,7 +248,7 @@ def _layout(spec: Spec) -> ObservationLayout:
     else:
         then, here = next((b, n) for b, n in zip(before, now, strict=True) if b != n)
         change = f"{_shown(then)} then, {_shown(here)} now"
-    raise ValueError(f"made for an observation of other entries ({change}): retrain it")
+    raise ValueError(f"{file}: made for an observation of other entries ({change}): retrain it")
 
 
 def _tensors(policy: Policy) -> Tensors:
