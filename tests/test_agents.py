@@ -1,4 +1,4 @@
-"""The contract of everything that drives, over every registered name."""
+"""The contract of everything that drives, over every registered name and over learned policies."""
 
 import copy
 import functools
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import pytest
+from learned_policies import DRIVING, driving_file
 from numpy.typing import NDArray
 
 import agents
@@ -21,7 +22,7 @@ from agents.registry import check_settings
 from experiments.cases import Case, run_case
 from lpv_track_env.registration import PATH_TRACKING
 
-each_agent = pytest.mark.parametrize("name", agents.names())
+each_agent = pytest.mark.parametrize("name", [*agents.names(), *DRIVING])
 
 
 def environment(trajectory: Any = "u-turn", **settings: Any) -> gymnasium.Env:
@@ -30,9 +31,15 @@ def environment(trajectory: Any = "u-turn", **settings: Any) -> gymnasium.Env:
     )
 
 
+def new(name: str, **settings: Any) -> Any:
+    return agents.make(
+        str(driving_file(name)) if name in DRIVING else name, environment(), **settings
+    )
+
+
 @functools.cache
 def shared(name: str, number: int) -> Any:
-    return agents.make(name, environment())
+    return new(name)
 
 
 def made(name: str, number: int = 0) -> Any:
@@ -55,7 +62,7 @@ class Drive(NamedTuple):
 def u_turn(name: str) -> Drive:
     """One drive of each agent, whose observations the tests share."""
     env = environment()
-    agent = agents.make(name, env)
+    agent = new(name)
     observation, info = env.reset(seed=0)
     rows, actions, errors = [], [], []
     done = False
@@ -234,8 +241,8 @@ def test_an_unknown_name_lists_the_known_and_the_nearest() -> None:
 
 @each_agent
 def test_an_unknown_setting_names_the_agent(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"'{name}' has no setting 'no_such_thing'"):
-        agents.make(name, environment(), no_such_thing=1)
+    with pytest.raises(ValueError, match=rf"{name}(\.json)?' has no setting 'no_such_thing'"):
+        new(name, no_such_thing=1)
 
 
 def test_an_unknown_setting_lists_the_nearest() -> None:

@@ -101,21 +101,22 @@ class LearnedPolicy:
 def _check_task(name: str, policy: Policy, task: DrivingTask) -> None:
     """Refuse a policy for observations or a control period that are not the task's."""
     seen, here = policy.layout, task.layout
-    if seen.preview_steps != here.preview_steps or not math.isclose(
+    same_layout = seen.preview_steps == here.preview_steps and math.isclose(
         seen.preview_period, here.preview_period, rel_tol=1e-9
-    ):
+    )
+    same_period = math.isclose(policy.control_period, task.control_period, rel_tol=1e-9)
+    layout = f"preview_steps={seen.preview_steps}, preview_period={seen.preview_period:g}"
+    period = f"control_period={policy.control_period:g}"
+    if not same_layout:
+        wanted = layout if same_period else f"{layout}, {period}"
         raise ValueError(
-            f"{name} sees preview_steps={seen.preview_steps}, "
-            f"preview_period={seen.preview_period:g} s; this environment has "
-            f"{here.preview_steps} and {here.preview_period:g}: make the environment with "
-            f"preview_steps={seen.preview_steps}, preview_period={seen.preview_period:g}, "
-            "or train one for it"
+            f"{name} sees {layout} s; this environment has {here.preview_steps} and "
+            f"{here.preview_period:g}: make the environment with {wanted}, or train one for it"
         )
-    if not math.isclose(policy.control_period, task.control_period, rel_tol=1e-9):
+    if not same_period:
         raise ValueError(
             f"{name} acts every {policy.control_period:g} s, this environment every "
-            f"{task.control_period:g}: make the environment with "
-            f"control_period={policy.control_period:g}, or train one for it"
+            f"{task.control_period:g}: make the environment with {period}, or train one for it"
         )
 
 

@@ -1,11 +1,15 @@
 """Policy files: NAME.json says what a policy is, NAME.safetensors holds its weights.
 
 Reading runs nothing that the files say: JSON and plain numbers, nothing is unpickled. The spec has
-a digest of itself and one of the weights, so a change in either is refused before it is used.
+a digest of itself and one of the weights, so a change in either is refused before it is used. (The
+digests find accidents. Who wants to can write another policy; it cannot do more than drive badly.)
 """
 
 import hashlib
 import json
+import re
+import reprlib
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +36,12 @@ KEYS = frozenset(
 LAYOUT_KEYS = frozenset(("preview_steps", "preview_period", "digest", "entries"))
 WEIGHTS_KEYS = frozenset(("file", "sha256", "bytes"))
 
+BESIDE = re.compile(r"[^/\\:\x00-\x1f\x7f]+\.safetensors")
+"""Names of weights: in the spec's own folder, on every system."""
+
+SHORT = reprlib.Repr()
+SHORT.maxstring = 80
+
 Spec = dict[str, Any]
 Tensors = dict[str, NDArray[np.float32]]
 
@@ -53,6 +63,8 @@ def write(policy: Policy, file: str | Path) -> None:
         raise ValueError(f"{file}: a policy is written to NAME.json, give it such a name")
     weights = save(_tensors(policy))
     beside = file.with_suffix(".safetensors")
+    if not BESIDE.fullmatch(beside.name):
+        raise ValueError(f"{file.name!r} is no name for a policy: leave out \\, : and the like")
     spec: Spec = {
         "format": FORMAT,
         "algorithm": policy.algorithm,
@@ -90,11 +102,12 @@ def read(file: str | Path) -> Policy:
     file = Path(file)
     _check_suffix(file)
     spec = _spec(file)
+    layout = _layout(file, spec["layout"])
     tensors = _weights(file, spec["weights"])
     try:
         return Policy(
             algorithm=spec["algorithm"],
-            layout=_layout(spec["layout"]),
+            layout=layout,
             control_period=spec["control_period"],
             feature_weight=tensors["features.weight"],
             feature_bias=tensors["features.bias"],
@@ -110,7 +123,7 @@ def read(file: str | Path) -> Policy:
             half=spec["half"],
             training=spec["training"],
         )
-    except (TypeError, ValueError) as error:
+    except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
 
 
@@ -133,24 +146,30 @@ def _check_suffix(file: Path) -> None:
 def _content(file: Path, most: int) -> bytes:
     """Content of a plain file of at most so many bytes."""
     try:
-        if file.exists() and not file.is_file():
+        status = file.stat()
+        if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for
             raise ValueError(f"{file} is not a plain file: give a policy's NAME.json")
+        if status.st_size > most:
+            raise ValueError(
+                f"{file}: {_too_large(status.st_size, most)}: it is no policy of this project"
+            )
         with file.open("rb") as handle:
-            content = handle.read(most + 1)
-            size = max(file.stat().st_size, len(content))
+            return handle.read(most)
     except FileNotFoundError:
         raise ValueError(
             f"there is no file {file}: give the path of a policy, its .safetensors beside it"
         ) from None
     except OSError as error:
         raise ValueError(f"cannot read {file}: {error.strerror}") from error
-    if size > most:
-        raise ValueError(f"{file}: {_too_large(size, most)}: it is no policy of this project")
-    return content
 
 
 def _too_large(size: int, most: int) -> str:
     return f"{size} bytes, at most {most} are allowed"
+
+
+def _shown(value: object) -> str:
+    """What a file says, as far as it fits on a line."""
+    return SHORT.repr(value)
 
 
 def _digest(spec: Spec) -> str:
@@ -172,23 +191,19 @@ def _spec(file: Path) -> Spec:
     form = spec.get("format")
     if form != FORMAT:
         raise ValueError(
-            f"{file}: format is {form!r}, this version reads {FORMAT!r}: retrain or upgrade"
+            f"{file}: format is {_shown(form)}, this version reads {FORMAT!r}: retrain or upgrade"
         )
     _check_keys(file, "", spec, KEYS)
     _check_keys(file, "layout.", spec["layout"], LAYOUT_KEYS)
     _check_keys(file, "weights.", spec["weights"], WEIGHTS_KEYS)
     try:
         unchanged = spec["digest"] == _digest(spec)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}: copy it anew") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{file} is not a policy's JSON: {error}: copy it anew") from error
     if not unchanged:
         raise ValueError(
             f"{file} was changed since it was written: copy it anew, or write the policy again"
         )
-    try:
-        _layout(spec["layout"])
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
     return spec
 
 
@@ -198,7 +213,8 @@ def _check_keys(file: Path, where: str, found: Any, known: frozenset[str]) -> No
     for what, keys in (("unknown", found.keys() - known), ("no", known - found.keys())):
         if keys:
             raise ValueError(
-                f"{file}: {what} key {where}{min(keys)}: write the policy again with this version"
+                f"{file}: {what} key {_shown(where + min(keys))}: "
+                "write the policy again with this version"
             )
 
 
@@ -211,12 +227,17 @@ def _layout_spec(layout: ObservationLayout) -> Spec:
     }
 
 
-def _layout(spec: Spec) -> ObservationLayout:
+def _layout(file: Path, spec: Spec) -> ObservationLayout:
     """The layout of a spec, if this version's entries are those that the policy was made for."""
     steps, period = spec["preview_steps"], spec["preview_period"]
     if type(steps) is not int or type(period) is not float:
-        raise ValueError("layout.preview_steps must be an integer, preview_period a number of s")
-    layout = ObservationLayout(steps, period)
+        raise ValueError(
+            f"{file}: layout.preview_steps must be an integer, preview_period a number of s"
+        )
+    try:
+        layout = ObservationLayout(steps, period)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
     if spec == _layout_spec(layout):
         return layout
     before, now = spec["entries"], _layout_spec(layout)["entries"]
@@ -226,8 +247,8 @@ def _layout(spec: Spec) -> ObservationLayout:
         change = f"{len(before)} scalar entries then, {len(now)} now"
     else:
         then, here = next((b, n) for b, n in zip(before, now, strict=True) if b != n)
-        change = f"{then} then, {here} now"
-    raise ValueError(f"made for an observation of other entries ({change}): retrain it")
+        change = f"{_shown(then)} then, {_shown(here)} now"
+    raise ValueError(f"{file}: made for an observation of other entries ({change}): retrain it")
 
 
 def _tensors(policy: Policy) -> Tensors:
@@ -240,10 +261,9 @@ def _tensors(policy: Policy) -> Tensors:
 def _weights(file: Path, spec: Spec) -> Tensors:
     """The tensors that a spec names, if they are the very bytes that were written."""
     name = spec["file"]
-    bare = isinstance(name, str) and Path(name).name == name and "\\" not in name
-    if not bare or not name.endswith(".safetensors"):
+    if not isinstance(name, str) or not BESIDE.fullmatch(name):
         raise ValueError(
-            f"{file}: weights.file is {name!r}, not a .safetensors in the same folder: "
+            f"{file}: weights.file is {_shown(name)}, not a .safetensors in the same folder: "
             "write the policy again"
         )
     beside = file.parent / name
@@ -260,15 +280,12 @@ def _weights(file: Path, spec: Spec) -> Tensors:
         found = dict(safetensors.deserialize(content))  # type: ignore[no-untyped-call]
     except safetensors.SafetensorError as error:
         raise ValueError(f"{beside} is not safetensors: {error}: write the policy again") from error
-    layers = max(len(found) // 2 - 1, 1)
-    names = {
-        f"{stage}.{part}"
-        for stage in ("features", *(f"layers.{k}" for k in range(min(layers, MOST_LAYERS))))
-        for part in ("weight", "bias")
-    }
+    layers = len({name.rpartition(".")[0] for name in found} - {"features"})
+    stages = ["features", *(f"layers.{k}" for k in range(min(max(layers, 1), MOST_LAYERS)))]
+    names = {f"{stage}.{part}" for stage in stages for part in ("weight", "bias")}
     if names != found.keys():
         raise ValueError(
-            f"{beside}: tensors {sorted(names ^ found.keys())[:3]} are missing or unknown: "
+            f"{beside}: tensors {_shown(sorted(names ^ found.keys()))} are missing or unknown: "
             "write the policy again"
         )
     for tensor, value in found.items():

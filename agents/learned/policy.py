@@ -109,7 +109,7 @@ class Policy:
             raise ValueError(f"layers must be 1 to {MOST_LAYERS}, not {len(self.layers)}")
         layers: list[Layer] = []
         for k, pair in enumerate(self.layers):
-            if len(pair) != 2:
+            if not isinstance(pair, tuple | list) or len(pair) != 2:
                 raise ValueError(f"layers[{k}] must be a weight and a bias")
             layers.append(_layer(f"layers[{k}]", *pair, len(layers[-1][1] if layers else bias)))
         if len(layers[-1][1]) != ACTIONS:
@@ -185,7 +185,10 @@ def _refuse(constant: str) -> NoReturn:
 def _number(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ValueError(f"{name} must be a number, not {value!r}")  # noqa: TRY004
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
     if not math.isfinite(number):
         raise ValueError(f"{name} must be finite, not {number}")
     return number
@@ -193,10 +196,13 @@ def _number(name: str, value: Any) -> float:
 
 def _array(name: str, value: ArrayLike, dtype: type[np.floating[Any]]) -> NDArray[Any]:
     try:
-        with np.errstate(over="ignore"):  # beyond float32 is not finite, below
-            array = np.array(value, dtype=dtype, order="C")
+        given = np.asarray(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} is not an array of numbers: {error}") from error
+    if given.dtype.kind not in "fiu":
+        raise ValueError(f"{name} is not an array of numbers, but of {given.dtype}")
+    with np.errstate(over="ignore"):  # beyond float32 is not finite, below
+        array = np.array(given, dtype=dtype, order="C")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} has values that are not finite")
     array.setflags(write=False)

@@ -1,0 +1,483 @@
+"""Agents of learned policies: what they compute, what they refuse, what belongs to a case."""
+
+import json
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from learned_policies import driving_file, driving_policy, plain_act, random_policy, written
+from numpy.typing import NDArray
+
+import agents
+from agents import registry
+from agents.base import DrivingTask
+from agents.learned import Policy, read, write
+from agents.learned.agent import Bc, LearnedPolicy, Ppo, Sac
+from agents.learned.network import Network
+from experiments.cases import Case, run_case
+from experiments.cli import main
+from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.registration import PATH_TRACKING
+
+WIDE = 1e6
+SHAPES = ((), (1,), (33,), (5, 64, 3))
+
+
+def environment(**settings: Any) -> gymnasium.Env:
+    return gymnasium.make(PATH_TRACKING, **{"trajectory": "u-turn", **settings})
+
+
+def task(**settings: Any) -> DrivingTask:
+    return DrivingTask.of(environment(**settings))
+
+
+def act(policy: Policy, rows: NDArray[Any], base: NDArray[Any], bound: float = WIDE) -> Any:
+    """What the compiled network does, its actions bounded to +- `bound`."""
+    actions = np.array(base, dtype=np.float64)
+    network = Network.of(policy, np.full(2, -bound), np.full(2, bound))
+    assert network.act(rows, actions) == np.isnan(actions).any(axis=1).sum()
+    return actions
+
+
+def observations(n: int, seed: int = 0) -> NDArray[np.float64]:
+    rows = np.random.default_rng(seed).normal(size=(n, 48)) * 3.0
+    return rows.astype(np.float32).astype(np.float64)
+
+
+# What the network computes.
+
+
+@pytest.mark.parametrize("origin", ["zero", "actuators", "lpv-nmpc"])
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("squash", ["tanh", "clip"])
+@pytest.mark.parametrize("hidden", SHAPES)
+def test_the_network_is_the_policys_formula(
+    origin: str, activation: str, squash: str, hidden: tuple[int, ...]
+) -> None:
+    policy = random_policy(origin=origin, activation=activation, squash=squash, hidden=hidden)
+    rows, base = observations(20), np.zeros((20, 2))
+    seen = rows
+    if origin == "actuators":
+        base = rows[:, [3, 4]]
+    elif origin == "lpv-nmpc":
+        base = np.random.default_rng(1).normal(size=(20, 2))
+        seen = np.hstack([rows, base])
+    expected = plain_act(policy, seen, base)
+    given = base if origin == "lpv-nmpc" else np.full((20, 2), 7.0)
+    # float32 sums of some tens of terms of size one
+    np.testing.assert_allclose(act(policy, rows, given), expected, atol=2e-5)
+    np.testing.assert_array_equal(
+        act(policy, rows, given, bound=0.5), act(policy, rows, given).clip(-0.5, 0.5)
+    )
+
+
+def test_features_are_clipped() -> None:
+    policy = random_policy(feature_limit=0.01)
+    rows = observations(5)
+    expected = plain_act(policy, rows, np.zeros((5, 2)))
+    np.testing.assert_allclose(act(policy, rows, np.zeros((5, 2))), expected, atol=1e-6)
+    wider = plain_act(random_policy(feature_limit=1e9), rows, np.zeros((5, 2)))
+    assert np.abs(wider - expected).max() > 0.1
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_the_network_is_torchs(activation: str) -> None:
+    torch = pytest.importorskip("torch")
+    policy = random_policy(hidden=(64, 64), activation=activation, squash="clip")
+    kind = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[activation]
+    modules: list[Any] = []
+    for weight, bias in policy.layers:
+        linear = torch.nn.Linear(weight.shape[1], weight.shape[0])
+        linear.load_state_dict(
+            {"weight": torch.tensor(weight.copy()), "bias": torch.tensor(bias.copy())}
+        )
+        modules += [linear, kind()]
+    network = torch.nn.Sequential(*modules[:-1])
+    rows = observations(50)
+    features = torch.nn.functional.linear(
+        torch.tensor(rows, dtype=torch.float32),
+        torch.tensor(policy.feature_weight.copy()),
+        torch.tensor(policy.feature_bias.copy()),
+    ).clamp(-3.0, 3.0)
+    with torch.no_grad():
+        u = network(features).clamp(-1.0, 1.0).numpy().astype(np.float64)
+    expected = policy.centre + policy.half * u
+    np.testing.assert_allclose(act(policy, rows, np.zeros((50, 2))), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("n", [2, 7, 64])
+def test_a_row_does_not_depend_on_the_others(n: int) -> None:
+    policy = random_policy(hidden=(33, 64))
+    rows = observations(n)
+    alone = np.vstack([act(policy, row[None], np.zeros((1, 2))) for row in rows])
+    np.testing.assert_array_equal(act(policy, rows, np.zeros((n, 2))), alone)
+    np.testing.assert_array_equal(act(policy, rows[::-1].copy(), np.zeros((n, 2))), alone[::-1])
+
+
+@pytest.mark.parametrize("squash", ["tanh", "clip"])
+def test_where_the_network_makes_no_number_the_vehicle_stops(squash: str) -> None:
+    # Two sums beyond float32 whose difference is no number.
+    huge = np.full((4, 12), 3e38, dtype=np.float32)
+    layers = ((huge, np.zeros(4)), (np.array([[1e38, -1e38, 1.0, 1.0]] * 2), np.zeros(2)))
+    policy = random_policy(
+        activation="relu", squash=squash, feature_weight=np.zeros((12, 48)),
+        feature_bias=np.full(12, 3.0), layers=layers,
+    )  # fmt: skip
+    agent = LearnedPolicy(task(), policy)
+    row = observations(1)[0]
+    row[0], row[4] = 4.0, 0.2
+    lost = row.copy()
+    lost[7] = np.nan
+    action = agent.predict(row)[0]
+    np.testing.assert_array_equal(action, agent.predict(lost)[0])
+    assert action[0] < 0.0
+    assert action[1] == np.float32(0.2)
+
+
+# An observation that is not finite.
+
+
+def test_a_blind_residual_leaves_it_to_the_nmpc() -> None:
+    env = environment()
+    residual, nmpc = agents.make(str(driving_file("residual")), env), agents.make("lpv-nmpc", env)
+    observation, _ = env.reset(options={"arc_length": 45.0, "lateral_error": 0.3})
+    first = residual.predict(observation)[0], nmpc.predict(observation)[0]
+    assert abs(first[0] - first[1]).max() > 1e-4
+    observation[5] = np.nan
+    np.testing.assert_array_equal(residual.predict(observation)[0], nmpc.predict(observation)[0])
+
+
+def test_rows_that_are_blind_do_not_touch_the_others() -> None:
+    agent = LearnedPolicy(task(), random_policy())
+    rows = observations(4)
+    whole = agent.predict(rows)[0]
+    rows[1, 5], rows[3, 40] = np.inf, 1e39  # more than float32 holds
+    torn = agent.predict(rows)[0]
+    np.testing.assert_array_equal(torn[[0, 2]], whole[[0, 2]])
+    assert np.isfinite(torn).all()
+
+
+# On top of the NMPC.
+
+
+def test_without_a_residual_it_is_the_nmpc() -> None:
+    layout = ObservationLayout()
+    nothing = random_policy(origin="lpv-nmpc", layout=layout, centre=np.zeros(2), half=np.zeros(2))
+    env = environment()
+    residual, nmpc = LearnedPolicy(DrivingTask.of(env), nothing), agents.make("lpv-nmpc", env)
+    observation, _ = env.reset(options={"lateral_error": 0.3})
+    memory = own = None
+    for k in range(20):
+        start = np.array([k in {0, 12}])
+        action, memory = residual.predict(observation, memory, start)
+        expected, own = nmpc.predict(observation, own, start)
+        np.testing.assert_array_equal(action, expected)
+        told, plain = residual.diagnostics(memory[0]), nmpc.diagnostics(own[0])  # type: ignore[attr-defined]
+        assert told["status"] == "SUCCESS"
+        np.testing.assert_array_equal(told["plan"], plain["plan"])
+        observation = env.step(action)[0]
+
+
+def test_a_case_of_a_residual_counts_the_nmpcs_solves() -> None:
+    result = run_case({"agent": str(driving_file("residual")), "trajectory": "u-turn"})
+    assert (result["status"], result["end"]) == ("ok", "finished")
+    assert result["solver"]["solves"] > 100
+    assert result["solver"]["failures"] == 0
+
+
+# Environments that it was not made for.
+
+
+def test_another_preview_is_refused_with_what_to_do() -> None:
+    with pytest.raises(ValueError, match="sees") as raised:
+        agents.make(str(driving_file("linear")), environment(preview_steps=30, preview_period=0.1))
+    assert str(raised.value) == (
+        f"policy {driving_file('linear')} sees preview_steps=20, preview_period=0.05 s; this "
+        "environment has 30 and 0.1: make the environment with preview_steps=20, "
+        "preview_period=0.05, or train one for it"
+    )
+
+
+def test_both_at_once_are_told_at_once() -> None:
+    with pytest.raises(ValueError, match=r"with .*preview_period=0\.05, control_period=0\.05, or"):
+        agents.make(str(driving_file("linear")), environment(control_period=0.02))
+
+
+def test_another_control_period_is_refused_with_what_to_do() -> None:
+    with pytest.raises(
+        ValueError,
+        match=r"policy 'ppo' acts every 0\.05 s, this environment every 0\.02: make the "
+        r"environment with control_period=0\.05, or train one for it",
+    ):
+        LearnedPolicy(task(control_period=0.02, preview_period=0.05), random_policy())
+
+
+def test_periods_that_differ_by_rounding_are_the_same() -> None:
+    policy = random_policy(control_period=0.1 * 3, layout=ObservationLayout(20, 0.1 * 3))
+    LearnedPolicy(task(control_period=0.3), policy)
+
+
+# Names.
+
+
+@pytest.mark.parametrize("kind", [Ppo, Sac, Bc])
+def test_the_named_agents_take_a_policy(kind: Callable[..., LearnedPolicy], tmp_path: Path) -> None:
+    file, row = written(tmp_path), observations(1)[0]
+    expected = LearnedPolicy(task(), file).predict(row)[0]
+    for given in (file, str(file), read(file)):
+        np.testing.assert_array_equal(kind(task(), policy=given).predict(row)[0], expected)
+
+
+def test_shipped_policies_are_named_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(registry.REGISTRY, "ppo", "agents.learned.agent:Ppo")
+    monkeypatch.setattr(registry, "CHECKPOINTS", tmp_path)
+    spec = {"agent": "ppo", "trajectory": "straight"}
+    assert registry.source_file("ppo") is None
+    without = Case(**spec).id
+    write(random_policy(), tmp_path / "ppo.json")
+    assert registry.source_file("ppo") == tmp_path / "ppo.json"
+    assert Case(**spec).id != without
+    file = written(tmp_path, name="other.json")
+    agent = agents.make("ppo", environment(), policy=str(file))
+    assert isinstance(agent, Ppo)
+    with pytest.raises(ValueError, match="'ppo' has no setting 'polcy'; known: policy"):
+        agents.make("ppo", environment(), polcy=str(file))
+
+
+@pytest.mark.parametrize("name", ["none.json", "none.safetensors", "none.zip"])
+def test_a_policy_that_is_not_there_is_one_line(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, out = str(tmp_path / name), str(tmp_path / "out")
+    arguments = ["--agents", file, "--trajectories", "straight", "--out", out]
+    assert main(["benchmark", *arguments]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert name in said
+    assert not Path(out).exists()
+
+
+# Cases.
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [{"agent": "{file}"}, {"agent": "stanley", "agent_settings": {"policy": "{file}"}}],
+    ids=["name", "setting"],
+)
+def test_a_cases_id_changes_with_the_policys_weights(spec: dict[str, Any], tmp_path: Path) -> None:
+    file = tmp_path / "mine.json"
+    spec = json.loads(json.dumps({**spec, "trajectory": "straight"}).replace("{file}", str(file)))
+    ids = []
+    for policy in (random_policy(0), random_policy(1), random_policy(0)):
+        write(policy, file)
+        ids.append(Case(**spec).id)
+    assert ids[0] == ids[2] != ids[1]
+
+
+def test_a_benchmark_with_a_policy_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("experiments.benchmark.write_report", lambda folder: folder / "none")
+    monkeypatch.chdir(tmp_path)
+    write(driving_policy("linear"), tmp_path / "mine.json")
+    arguments = ["--agents", "mine.json", "--trajectories", "u-turn", "--workers", "1"]
+    assert main(["benchmark", *arguments, "--out", "results"]) == 0
+    (case,) = [json.loads(line) for line in Path("results/cases.jsonl").read_text().splitlines()]
+    assert (case["agent"], case["status"], case["end"]) == ("mine.json", "ok", "finished")
+    assert "mine.json" in capsys.readouterr().out
+
+
+# Models of Stable-Baselines3.
+
+
+def box(low: Any, high: Any, size: int) -> gymnasium.spaces.Box:
+    return gymnasium.spaces.Box(np.float32(low), np.float32(high), (size,), np.float32)
+
+
+class Spaces(gymnasium.Env):
+    """An environment of which a model takes the spaces."""
+
+    def __init__(self, size: int, actions: gymnasium.spaces.Box) -> None:
+        self.observation_space, self.action_space = box(-100.0, 100.0, size), actions
+
+
+def sb3_model(
+    algorithm: str, activation: str, size: int, actions: gymnasium.spaces.Box, **kwargs: Any
+) -> Any:
+    stable_baselines3 = pytest.importorskip("stable_baselines3")
+    import torch
+
+    kind = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[activation]
+    kwargs = {"policy_kwargs": {"activation_fn": kind, "net_arch": [32, 16]}, **kwargs}
+    if algorithm != "ppo":
+        kwargs = {"buffer_size": 10, **kwargs}
+    model = getattr(stable_baselines3, algorithm.upper())(
+        "MlpPolicy", Spaces(size, actions), seed=0, device="cpu", **kwargs
+    )
+    if algorithm == "ppo":
+        # Its last layer begins a hundred times smaller than the others: nothing would be clipped.
+        with torch.no_grad():
+            model.policy.action_net.weight.mul_(300.0)
+    return model
+
+
+SI = gymnasium.spaces.Box(np.float32([-5.0, -0.5]), np.float32([3.5, 0.5]), dtype=np.float32)
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3"])
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("actions", [box(-1.0, 1.0, 2), SI], ids=["unit", "si"])
+def test_a_policy_is_its_sb3_model(
+    algorithm: str, activation: str, actions: gymnasium.spaces.Box
+) -> None:
+    from agents.learned.sb3 import from_sb3
+
+    rng = np.random.default_rng(0)
+    weight, bias = rng.normal(size=(9, 48)) / 5.0, rng.normal(size=9)
+    model = sb3_model(algorithm, activation, 9, actions)
+    policy = from_sb3(
+        model, layout=ObservationLayout(), control_period=0.05, algorithm=algorithm,
+        feature_weight=weight, feature_bias=bias, feature_limit=2.0, origin="zero",
+        centre=np.zeros(2), half=np.ones(2), training={},
+    )  # fmt: skip
+    rows = observations(200)
+    features = np.clip(
+        rows.astype(np.float32) @ policy.feature_weight.T + policy.feature_bias, -2.0, 2.0
+    )
+    expected = model.predict(features, deterministic=True)[0]
+    middle, reach = 0.5 * (actions.high + actions.low), 0.5 * (actions.high - actions.low)
+    u = (expected - middle) / reach
+    assert np.ptp(u, axis=0).min() > 0.1
+    if algorithm == "ppo":
+        assert (np.abs(u) > 0.9999).any()
+    np.testing.assert_allclose(act(policy, rows, np.zeros((200, 2))), u, atol=1e-5)
+
+
+def test_what_sb3_has_besides_is_refused() -> None:
+    stable_baselines3 = pytest.importorskip("stable_baselines3")
+    import torch
+
+    from agents.learned.sb3 import from_sb3
+
+    def refused(model: Any) -> str:
+        with pytest.raises(ValueError, match="cannot be taken") as raised:
+            from_sb3(
+                model, layout=ObservationLayout(), control_period=0.05, algorithm="x",
+                feature_weight=np.ones((9, 48)), feature_bias=np.zeros(9), feature_limit=1.0,
+                origin="zero", centre=[0.0, 0.0], half=[1.0, 1.0], training={},
+            )  # fmt: skip
+        assert "\n" not in str(raised.value)
+        return str(raised.value)
+
+    unit = box(-1.0, 1.0, 2)
+    elu = {"policy_kwargs": {"activation_fn": torch.nn.ELU}}
+    assert "Tanh or ReLU" in refused(sb3_model("ppo", "tanh", 9, unit, **elu))
+    assert "use_sde=False" in refused(sb3_model("ppo", "tanh", 9, unit, use_sde=True))
+    assert "use_sde=False" in refused(sb3_model("sac", "tanh", 9, unit, use_sde=True))
+    dqn = gymnasium.make("CartPole-v1")
+    assert "only MlpPolicy" in refused(stable_baselines3.DQN("MlpPolicy", dqn, buffer_size=10))
+
+    class Extractor(stable_baselines3.common.torch_layers.FlattenExtractor):
+        pass
+
+    own = {"policy_kwargs": {"features_extractor_class": Extractor}}
+    assert "train with FlattenExtractor" in refused(sb3_model("td3", "relu", 9, unit, **own))
+
+
+# lpv-track import-policy.
+
+
+@pytest.fixture(params=["si", "rescaled"])
+def saved(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, Any, Any]:
+    """A model of plain SB3 on this project's environment, saved, and that environment."""
+    stable_baselines3 = pytest.importorskip("stable_baselines3")
+    env = environment(preview_steps=10)
+    if request.param == "rescaled":
+        env = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))  # type: ignore[attr-defined]
+    model = stable_baselines3.PPO("MlpPolicy", env, n_steps=32, batch_size=32, seed=0, device="cpu")
+    model.learn(32)
+    model.save(tmp_path / "model.zip")
+    return tmp_path / "model.zip", model, env
+
+
+def imported(model: Path, *more: str) -> int:
+    return main(
+        ["import-policy", str(model), "--algorithm", "ppo", "--trust",
+         "--out", str(model.with_name("mine.json")), *more]
+    )  # fmt: skip
+
+
+def test_a_model_of_plain_sb3_is_imported(
+    saved: tuple[Path, Any, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, model, env = saved
+    assert imported(file, "--preview-steps", "10") == 0
+    assert "28 -> 28 -> 64 -> 64 -> 2" in capsys.readouterr().out
+    policy = read(file.with_name("mine.json"))
+    assert policy.training["steps"] == 32
+    agent = agents.make(str(file.with_name("mine.json")), env)
+    observation, _ = env.reset(seed=0)
+    half = np.array([4.25, np.pi / 6])
+    for _ in range(10):
+        chosen = model.predict(observation, deterministic=True)[0]
+        if env.action_space.high[0] == 1.0:
+            expected = np.array([-0.75, 0.0]) + half * chosen
+        else:
+            expected = chosen
+        # 1e-5 of the range
+        np.testing.assert_allclose(
+            agent.predict(observation)[0] / half, expected / half, rtol=0.0, atol=1e-5
+        )
+        observation = env.step(env.action_space.sample())[0]
+
+
+def test_a_model_of_something_else_is_one_line(
+    saved: tuple[Path, Any, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, _, env = saved
+
+    def refused(*more: str, model: Path = file) -> str:
+        assert imported(model, *more) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert not model.with_name("mine.json").exists()
+        return said
+
+    assert "say --preview-steps" in refused()
+    assert "unknown vehicle" in refused("--vehicle", "m2-bus")
+    with zipfile.ZipFile(file.with_name("other.zip"), "w") as archive:
+        archive.writestr("data", "{}")
+    assert "PPO of Stable-Baselines3" in refused(model=file.with_name("other.zip"))
+    file.with_name("none.zip").write_bytes(b"none")
+    assert "PPO of Stable-Baselines3" in refused(model=file.with_name("none.zip"))
+    if env.action_space.high[0] != 1.0:
+        wide = file.with_name("wide.json")
+        wide.write_text(vehicle_json())
+        assert "say --vehicle" in refused("--preview-steps", "10", "--vehicle", str(wide))
+
+
+def vehicle_json() -> str:
+    """The default vehicle with more steering."""
+    import dataclasses
+
+    from lpv_track_env.vehicle import VEHICLES
+
+    values = dataclasses.asdict(VEHICLES["m2-minibus"])
+    return json.dumps({**values, "name": "wide", "max_steering_angle": 0.7})
+
+
+def test_without_sb3_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    (tmp_path / "model.zip").write_bytes(b"")
+    assert imported(tmp_path / "model.zip") == 2
+    assert "pip install 'lpv-track-env[rl]'" in capsys.readouterr().err
