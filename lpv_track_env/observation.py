@@ -44,6 +44,12 @@ SCALARS = (
 
 PREVIEW_BOUNDS = (("preview_curvature", "1/m", 20.0), ("preview_speed", "m/s", 100.0))
 
+MIRRORED = (
+    "lateral_speed", "yaw_rate", "steering_angle", "lateral_error", "heading_error",
+    "preview_curvature",
+)  # fmt: skip
+"""Entries that change sign where left and right are exchanged."""
+
 Array = NDArray[np.float64]
 
 
@@ -110,6 +116,14 @@ class ObservationLayout:
         scalars = [bound for _, _, bound in SCALARS]
         previews = [bound for _, _, bound in PREVIEW_BOUNDS for _ in range(self.preview_steps)]
         return np.array(scalars + previews, dtype=np.float32)
+
+    @property
+    def mirror(self) -> NDArray[np.float32]:
+        """Factor of each entry where left and right are exchanged: 1 or -1, shape (size,)."""
+        signs = np.ones(self.size, dtype=np.float32)
+        for name in MIRRORED:
+            signs[self.slices[name]] = -1.0
+        return signs
 
     @property
     def digest(self) -> str:

@@ -1,5 +1,6 @@
 """Agents of learned policies: what they compute, what they refuse, what belongs to a case."""
 
+import dataclasses
 import json
 import sys
 import zipfile
@@ -74,6 +75,29 @@ def test_the_network_is_the_policys_formula(
     np.testing.assert_array_equal(
         act(policy, rows, given, bound=0.5), act(policy, rows, given).clip(-0.5, 0.5)
     )
+
+
+@pytest.mark.parametrize("origin", ["zero", "actuators", "lpv-nmpc"])
+def test_a_symmetric_policy_does_not_know_left_from_right(origin: str) -> None:
+    policy = random_policy(origin=origin, symmetric=True, centre=np.array([0.1, 0.0]))
+    once = dataclasses.replace(policy, symmetric=False)
+    rng, size = np.random.default_rng(4), policy.layout.size
+    rows, base = rng.normal(size=(50, size)), rng.normal(scale=0.1, size=(50, 2))
+    flip, turned = policy.layout.mirror.astype(np.float64), np.array([1.0, -1.0])
+    far = np.array([9.0, 9.0])
+    results = {}
+    for name, kind, given, at in (
+        ("both", policy, rows, base), ("mirrored", policy, rows * flip, base * turned),
+        ("one", once, rows, base), ("other", once, rows * flip, base * turned),
+    ):  # fmt: skip
+        results[name] = at.copy()
+        assert Network.of(kind, -far, far).act(given, results[name]) == 0
+    np.testing.assert_array_equal(results["mirrored"], results["both"] * turned)
+    mean = 0.5 * (results["one"] + results["other"] * turned)
+    np.testing.assert_allclose(results["both"], mean, atol=1e-12)
+    assert np.abs(results["one"] - results["other"] * turned).max() > 0.1
+    with pytest.raises(ValueError, match="steers about 0"):
+        random_policy(symmetric=True)
 
 
 def test_features_are_clipped() -> None:

@@ -72,8 +72,9 @@ def put_weights(file: Path, content: bytes) -> None:
 def test_round_trip_bit_for_bit(origin: str, activation: str, squash: str, tmp_path: Path) -> None:
     policy = random_policy(
         origin=origin, activation=activation, squash=squash, hidden=(5, 1, 300),
+        symmetric=origin == "zero",
         layout=ObservationLayout(7, 0.1 + 0.2), control_period=1 / 30, feature_limit=1e30,
-        centre=np.array([-0.0, 5e-324]), half=np.array([0.0, 1 / 3]),
+        centre=np.array([5e-324, -0.0]), half=np.array([0.0, 1 / 3]),
     )  # fmt: skip
     file = written(tmp_path, policy)
     assert same(read(file), policy)

@@ -30,7 +30,7 @@ MOST_SPEC = 2**20
 KEYS = frozenset(
     (
         "format", "algorithm", "control_period", "layout", "activation", "squash", "origin",
-        "centre", "half", "feature_limit", "weights", "training", "digest",
+        "centre", "half", "feature_limit", "symmetric", "weights", "training", "digest",
     )
 )  # fmt: skip
 LAYOUT_KEYS = frozenset(("preview_steps", "preview_period", "digest", "entries"))
@@ -76,6 +76,7 @@ def write(policy: Policy, file: str | Path) -> None:
         "centre": policy.centre.tolist(),
         "half": policy.half.tolist(),
         "feature_limit": policy.feature_limit,
+        "symmetric": policy.symmetric,
         "weights": {
             "file": beside.name, "sha256": hashlib.sha256(weights).hexdigest(),
             "bytes": len(weights),
@@ -122,6 +123,7 @@ def read(file: str | Path) -> Policy:
             centre=spec["centre"],
             half=spec["half"],
             training=spec["training"],
+            symmetric=spec["symmetric"],
         )
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error

@@ -76,8 +76,8 @@ def bend(y: Array, outputs: int, kind: int, limit: Any) -> None:
 
 @compiled
 def act(
-    rows: Array, weights: Array, table: Array, numbers: Array, origin: int, scratch: Array,
-    actions: Array,
+    rows: Array, weights: Array, table: Array, numbers: Array, mirrors: Array, origin: int,
+    scratch: Array, actions: Array,
 ) -> int:  # fmt: skip
     """Put an action in the place of each row's base action; how many rows have none.
 
@@ -89,6 +89,9 @@ def act(
         All weights and biases, float32; (1 + layers, 4) int64, the features first.
     numbers
         Limit, centre, half, low and high, float64.
+    mirrors
+        (looks, inputs) float32: factors of the inputs for each look at them, all 1 in the first; a
+        second one is mirrored.
     origin
         Index in `ORIGINS`.
     scratch
@@ -97,28 +100,36 @@ def act(
         (n, 2) float64: read for origin "lpv-nmpc", then written; NaN where the row is not finite
         or the network makes no number of it.
     """
-    size, lost = rows.shape[1], 0
+    size, looks, lost = rows.shape[1], mirrors.shape[0], 0
+    share = 1.0 / looks
     for row in range(rows.shape[0]):
-        x, y = scratch[0], scratch[1]
         finite = True
         for i in range(size):
-            x[i] = np.float32(rows[row, i])
-            finite = finite and math.isfinite(x[i])
+            finite = finite and math.isfinite(np.float32(rows[row, i]))
         base_a, base_delta = 0.0, 0.0
         if origin == FROM_ACTUATORS:
             base_a, base_delta = rows[row, IN_FORCE_A], rows[row, IN_FORCE_DELTA]
         elif origin == FROM_BASE:
             base_a, base_delta = actions[row, 0], actions[row, 1]
-            x[size], x[size + 1] = np.float32(base_a), np.float32(base_delta)
-        limit = np.float32(numbers[LIMIT])
-        for k in range(table.shape[0]):
-            layer = table[k]
-            dense(x, layer, weights, y)
-            bend(y, layer[OUTPUTS], layer[BEND], limit)
-            limit = np.float32(1.0)
-            x, y = y, x
-        a = base_a + numbers[CENTRE] + numbers[HALF] * x[0]
-        delta = base_delta + numbers[CENTRE + 1] + numbers[HALF + 1] * x[1]
+        u_a = u_delta = 0.0
+        for look in range(looks):
+            x, y = scratch[0], scratch[1]
+            for i in range(size):
+                x[i] = np.float32(rows[row, i]) * mirrors[look, i]
+            if origin == FROM_BASE:
+                x[size] = np.float32(base_a) * mirrors[look, size]
+                x[size + 1] = np.float32(base_delta) * mirrors[look, size + 1]
+            limit = np.float32(numbers[LIMIT])
+            for k in range(table.shape[0]):
+                layer = table[k]
+                dense(x, layer, weights, y)
+                bend(y, layer[OUTPUTS], layer[BEND], limit)
+                limit = np.float32(1.0)
+                x, y = y, x
+            u_a += share * x[0]
+            u_delta += share * x[1] * (1.0 - 2.0 * look)
+        a = base_a + numbers[CENTRE] + numbers[HALF] * u_a
+        delta = base_delta + numbers[CENTRE + 1] + numbers[HALF + 1] * u_delta
         if finite and not (math.isnan(a) or math.isnan(delta)):
             actions[row, 0] = min(max(a, numbers[LOW]), numbers[HIGH])
             actions[row, 1] = min(max(delta, numbers[LOW + 1]), numbers[HIGH + 1])
@@ -135,6 +146,7 @@ class Network:
     weights: NDArray[np.float32]
     table: NDArray[np.int64]
     numbers: NDArray[np.float64]
+    mirrors: NDArray[np.float32]
     origin: int
     scratch: NDArray[np.float32]
 
@@ -153,10 +165,14 @@ class Network:
             np.concatenate(packed),
             np.array(table, dtype=np.int64),
             numbers,
+            np.stack([np.ones_like(policy.mirror), policy.mirror][: 1 + policy.symmetric]),
             ORIGINS.index(policy.origin),
             np.zeros((2, max(policy.sizes)), dtype=np.float32),
         )
 
     def act(self, rows: Array, actions: Array) -> int:
         """Actions (n, 2) of rows (n, size), see `act`; how many rows have none."""
-        return act(rows, self.weights, self.table, self.numbers, self.origin, self.scratch, actions)
+        return act(
+            rows, self.weights, self.table, self.numbers, self.mirrors, self.origin, self.scratch,
+            actions,
+        )  # fmt: skip

@@ -67,6 +67,9 @@ class Policy:
         (2,) m/s^2 and rad, float64; half >= 0.
     training
         Where it comes from, in plain JSON: command, seed, steps, vehicle, versions, ...
+    symmetric
+        Whether u is the mean of the network's output and, mirrored back, of its output for the
+        mirrored observation: left and right are then the same to the policy.
 
     Arrays are copied and read-only.
 
@@ -90,6 +93,7 @@ class Policy:
     centre: Array
     half: Array
     training: Mapping[str, Any] = field(default_factory=dict)
+    symmetric: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.algorithm, str) or not self.algorithm.strip():
@@ -104,6 +108,7 @@ class Policy:
         centre, half = (_action(name, getattr(self, name)) for name in ("centre", "half"))
         if half.min() < 0.0:
             raise ValueError(f"half must not be negative, but is {half.tolist()}")
+        _check_symmetry(self.symmetric, centre)
         weight, bias = _layer("feature", self.feature_weight, self.feature_bias, self.inputs)
         if not 1 <= len(self.layers) <= MOST_LAYERS:
             raise ValueError(f"layers must be 1 to {MOST_LAYERS}, not {len(self.layers)}")
@@ -129,6 +134,12 @@ class Policy:
     def inputs(self) -> int:
         """Length of o: the observation, and for origin "lpv-nmpc" the base action."""
         return self.layout.size + (ACTIONS if self.origin == "lpv-nmpc" else 0)
+
+    @property
+    def mirror(self) -> Weights:
+        """Factor of each entry of o where left and right are exchanged, (inputs,)."""
+        base = [1.0, -1.0] if self.origin == "lpv-nmpc" else []
+        return np.concatenate([self.layout.mirror, base]).astype(np.float32)
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -180,6 +191,13 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _refuse(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is not JSON")
+
+
+def _check_symmetry(symmetric: object, centre: Array) -> None:
+    if not isinstance(symmetric, bool):
+        raise ValueError(f"symmetric must be true or false, not {symmetric!r}")  # noqa: TRY004
+    if symmetric and centre[1] != 0.0:
+        raise ValueError(f"a symmetric policy steers about 0, not about {centre[1]} rad")
 
 
 def _number(name: str, value: Any) -> float:

@@ -32,6 +32,7 @@ def from_sb3(
     centre: ArrayLike,
     half: ArrayLike,
     training: Mapping[str, Any],
+    symmetric: bool = False,
 ) -> Policy:
     """Take the deterministic policy out of a model of SB3.
 
@@ -42,7 +43,7 @@ def from_sb3(
     ----------
     model
         PPO, SAC or TD3 (or another algorithm with the same policy class), "MlpPolicy".
-    layout, control_period, algorithm, feature_weight, feature_bias, feature_limit, origin, centre, half, training
+    layout, control_period, algorithm, feature_weight, feature_bias, feature_limit, origin, centre, half, training, symmetric
         Of the `Policy`; the features are what the model was shown, worked out outside of it.
 
     Raises
@@ -75,6 +76,7 @@ def from_sb3(
         centre=centre,  # type: ignore[arg-type]
         half=half,  # type: ignore[arg-type]
         training=training,
+        symmetric=symmetric,
     )
 
 

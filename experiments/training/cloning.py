@@ -148,5 +148,6 @@ class CloningTrainer(Trainer):
             algorithm=self.settings.algorithm, layout=self.env.task.layout,
             control_period=self.settings.control_period, layers=layers,
             activation=self.hyper["activation"], squash="clip", training=training,
+            symmetric=True,
             **{item.name: getattr(scaling, item.name) for item in fields(scaling)},
         )  # fmt: skip

@@ -184,6 +184,6 @@ class Sb3Trainer(Trainer):
         scaling = self.env.scaling
         return from_sb3(
             self.model, layout=self.env.task.layout, control_period=self.settings.control_period,
-            algorithm=self.settings.algorithm, training=training,
+            algorithm=self.settings.algorithm, training=training, symmetric=True,
             **{item.name: getattr(scaling, item.name) for item in fields(scaling)},
         )  # fmt: skip
