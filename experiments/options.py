@@ -22,7 +22,7 @@ def _benchmark(add: Add) -> None:
     benchmark.add_argument(
         "--suite",
         default="paper",
-        help="paper (default), quick, realtime, plants, converged, sideslip or frozen",
+        help="paper (default), quick, realtime, learned, plants, converged, sideslip or frozen",
     )
     benchmark.add_argument(
         "--agents",

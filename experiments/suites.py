@@ -19,6 +19,12 @@ solution in some percent of such wild situations, though never on the six.
 RAW = tuple(f"{name}-raw" for name in SIX)
 RAW_PREVIEW = {"preview_steps": 30, "preview_period": 0.1}
 LEAST_SEEDS = 10
+HELD_OUT = tuple(f"random-{seed}" for seed in range(20))
+"""Random paths that no training of `lpv-track train` has seen, nor its validation."""
+BESIDE = {"initial_error_range": [0.3, 0.1, 0.5]}
+"""Episodes that begin beside the path: in simulation, all that a seed can change."""
+LEARNED = ("ppo", "sac", "bc", "residual")
+"""Shipped policies; they see 1 s ahead, too little to cut the corners of raw waypoints."""
 DEMONSTRATION = "lpv-mpc-frozen"
 """An agent that shows why not to drive so."""
 
@@ -60,13 +66,14 @@ def paper(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
     """The paper's six in both speed modes, as raw waypoints, with the other vehicle, in real time.
 
     On raw waypoints a corner must be seen 3 s ahead to be cut: agents get 30 preview steps of
-    0.1 s there. IPOPT's NMPC, which takes a hundred times as long as all others together, drives
-    the six at variable speed; `converged` has the rest.
+    0.1 s there, and learned policies, made for 1 s, stay away. IPOPT's NMPC, which takes a hundred
+    times as long as all others together, drives the six at variable speed; `converged` has the
+    rest.
     """
     solved, fast = _by_speed(agent_names)
     specs = [
         *grid(agent_names, SIX, seeds=seeds),
-        *grid(fast, RAW, seeds=seeds, env_settings=RAW_PREVIEW),
+        *grid(_far_seeing(fast), RAW, seeds=seeds, env_settings=RAW_PREVIEW),
         *grid(fast, SIX, speed_modes=("fixed",), seeds=seeds),
         *grid(fast, SIX, vehicles=PAPER_VEHICLES[1:], seeds=seeds),
         *realtime(fast, seeds),
@@ -77,8 +84,24 @@ def paper(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
 
 def realtime(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
     """The six under the conditions of a real vehicle, at least ten seeds, that intervals mean."""
-    several = seeds if len(seeds) >= LEAST_SEEDS else range(LEAST_SEEDS)
-    return grid(agent_names, SIX, seeds=several, conditions="realtime")
+    return grid(agent_names, SIX, seeds=_several(seeds), conditions="realtime")
+
+
+def learned(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
+    """Learned policies beside all others that do not solve to convergence.
+
+    The six and unseen random paths, in simulation and under the conditions of a real vehicle, and
+    the six in simulation from beside the path.
+    """
+    _, fast = _by_speed(agent_names)
+    several = _several(seeds)
+    return [
+        *grid(fast, SIX, seeds=seeds),
+        *grid(fast, SIX, seeds=several, env_settings=BESIDE),
+        *realtime(fast, seeds),
+        *grid(fast, HELD_OUT, seeds=seeds),
+        *grid(fast, HELD_OUT, seeds=several, conditions="realtime"),
+    ]
 
 
 def converged(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
@@ -123,6 +146,14 @@ def independent(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
     ]
 
 
+def _several(seeds: Sequence[int]) -> Sequence[int]:
+    return seeds if len(seeds) >= LEAST_SEEDS else range(LEAST_SEEDS)
+
+
+def _far_seeing(agent_names: Iterable[str]) -> list[str]:
+    return [name for name in agent_names if name not in LEARNED]
+
+
 def _by_speed(agent_names: Sequence[str]) -> tuple[list[str], list[str]]:
     """Agents that solve to convergence at every step, and all others."""
     solved = [name for name in agent_names if name == "lpv-nmpc-ipopt"]
@@ -134,6 +165,7 @@ SUITES = {
     "quick": quick,
     "sideslip": sideslip,
     "realtime": realtime,
+    "learned": learned,
     "converged": converged,
     "frozen": frozen,
     "plants": independent,

@@ -6,7 +6,17 @@ import pytest
 
 import agents
 from experiments.cases import Case
-from experiments.suites import DEMONSTRATION, LEAST_SEEDS, RAW, SIX, SUITES, default_agents
+from experiments.suites import (
+    BESIDE,
+    DEMONSTRATION,
+    HELD_OUT,
+    LEAST_SEEDS,
+    RAW,
+    SIX,
+    SUITES,
+    default_agents,
+)
+from experiments.training.seeds import TRAINING_PATHS, VALIDATION_PATHS
 
 
 @pytest.mark.parametrize("suite", SUITES)
@@ -14,10 +24,12 @@ def test_cases_of_a_suite_are_valid_and_distinct(suite: str) -> None:
     specs = SUITES[suite](default_agents(), [0, 1])
     cases = [Case(**spec) for spec in specs]
     assert len({case.id for case in cases}) == len(cases) > 0
-    ideal = [case for case in cases if case.conditions == "simulation"]
+    ideal = [
+        case for case in cases if case.conditions == "simulation" and case.env_settings != BESIDE
+    ]
     assert {case.seed for case in ideal} in (set(), {0, 1})
     # Where chance has a say, intervals must mean something.
-    other = [case for case in cases if case.conditions != "simulation"]
+    other = [case for case in cases if case not in ideal]
     assert {case.seed for case in other} in (set(), set(range(LEAST_SEEDS)))
     assert len(ideal) + len(other) == len(cases)
 
@@ -63,3 +75,17 @@ def test_frozen_compares_both_forms_with_the_nmpc() -> None:
         (DEMONSTRATION, "{'form': 'literal'}"): 6,
         (DEMONSTRATION, "{'form': 'sinc'}"): 6,
     }
+
+
+def test_learned_policies_are_compared_on_paths_that_nobody_trained_on() -> None:
+    specs = SUITES["learned"](default_agents(), [0])
+    fast = set(default_agents()) - {"lpv-nmpc-ipopt"}
+    drives = Counter((spec["agent"], str(spec.get("conditions"))) for spec in specs)
+    alone = 6 + 6 * LEAST_SEEDS + len(HELD_OUT)
+    assert drives == {
+        **{(name, "None"): alone for name in fast},
+        **{(name, "realtime"): (6 + len(HELD_OUT)) * LEAST_SEEDS for name in fast},
+    }
+    numbers = [int(name.removeprefix("random-")) for name in HELD_OUT]
+    assert len(numbers) == 20
+    assert max(numbers) < TRAINING_PATHS < VALIDATION_PATHS

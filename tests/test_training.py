@@ -18,15 +18,15 @@ from experiments import cli
 from experiments.cases import Case, run_case
 from experiments.suites import SIX
 from experiments.training import checkpoint
-from experiments.training.environments import (
+from experiments.training.environments import load_paths
+from experiments.training.loop import Listener, make_trainer, train
+from experiments.training.seeds import (
     TRAINING_EPISODES,
     TRAINING_PATHS,
     VALIDATION_PATHS,
     episode_seed,
-    load_paths,
     path_names,
 )
-from experiments.training.loop import Listener, make_trainer, train
 from experiments.training.settings import (
     ALGORITHMS,
     HYPERPARAMETERS,

@@ -1,7 +1,7 @@
 """What Stable-Baselines3 learns on: scaled features and actions over the vector environments."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -13,6 +13,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.base import DrivingTask
 from agents.delay import DelayMemory, NearFuture
+from agents.learned.policy import Policy
+from agents.learned.sb3 import from_sb3
 from agents.learned.scaling import Scaling, usual_scaling
 from agents.sb3 import TrackingVecEnv
 
@@ -153,6 +155,30 @@ class LearnerVecEnv(VecEnv):
     def origins(self) -> NDArray[np.float64]:
         """What actions are additions to now, (n, 2)."""
         return np.concatenate([part.origin for part in self._parts])
+
+    def policy_of(
+        self, model: Any, algorithm: str, training: Mapping[str, Any] | None = None
+    ) -> Policy:
+        """Take the policy out of a model of SB3 that has learned on this, ready to be written.
+
+        Parameters
+        ----------
+        model
+            PPO, SAC or TD3 with "MlpPolicy".
+        algorithm
+            What it is called.
+        training
+            Where it comes from, in plain JSON.
+
+        Raises
+        ------
+        ValueError
+            For another kind of policy.
+        """
+        return from_sb3(
+            model, layout=self.task.layout, control_period=self.task.control_period,
+            algorithm=algorithm, training=training or {}, symmetric=True, **vars(self.scaling),
+        )  # fmt: skip
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed environment i with seed + i at the next reset."""

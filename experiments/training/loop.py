@@ -16,8 +16,9 @@ from experiments.interrupts import Interrupts
 from experiments.results import hardware, revision, versions
 from experiments.training import checkpoint
 from experiments.training.cloning import CloningTrainer
-from experiments.training.environments import load_paths, make_learner_env, path_names
+from experiments.training.environments import load_paths, make_learner_env
 from experiments.training.sb3_trainer import Sb3Trainer
+from experiments.training.seeds import path_names
 from experiments.training.settings import TrainingSettings, difference
 from experiments.training.trainer import Trainer
 from experiments.training.validation import validate

@@ -13,7 +13,6 @@ SAC (Haarnoja et al. 2018) and TD3 (Fujimoto et al. 2018): `buffer` transitions,
 """
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,6 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from agents.learned.learner import LearnerVecEnv
 from agents.learned.policy import Policy
-from agents.learned.sb3 import from_sb3
 from experiments.training.settings import TrainingSettings
 from experiments.training.start import check_start, put_layers
 from experiments.training.trainer import Tick, Trainer
@@ -181,9 +179,4 @@ class Sb3Trainer(Trainer):
 
     def policy(self, training: Mapping[str, Any]) -> Policy:
         """The deterministic policy."""
-        scaling = self.env.scaling
-        return from_sb3(
-            self.model, layout=self.env.task.layout, control_period=self.settings.control_period,
-            algorithm=self.settings.algorithm, training=training, symmetric=True,
-            **{item.name: getattr(scaling, item.name) for item in fields(scaling)},
-        )  # fmt: skip
+        return self.env.policy_of(self.model, self.settings.algorithm, training)

@@ -10,7 +10,7 @@ import torch
 
 from agents.learned.learner import LearnerVecEnv
 from agents.learned.policy import Policy
-from experiments.training.environments import episode_seed
+from experiments.training.seeds import episode_seed
 from experiments.training.settings import TrainingSettings
 
 Tick = Callable[[int, str], None]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from experiments.cases import Case, run_case
-from experiments.training.environments import VALIDATION_PATHS, random_names
+from experiments.training.seeds import VALIDATION_PATHS, random_names
 from experiments.training.settings import TrainingSettings
 
 EDGE = 5.0
