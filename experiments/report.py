@@ -10,6 +10,7 @@ import numpy as np
 
 from experiments import figures, published, tables
 from experiments.figures import Drive, Panel, Styles
+from experiments.html_tables import html_table, html_tables
 from experiments.report_page import ERRATA, PAGE
 from experiments.results import ResultStore
 from trajectories.atomic import write_atomically
@@ -215,7 +216,7 @@ def key_figures(cases: Sequence[Result]) -> str:
         "agent", "whole path", "mean ALE, m", "worst MLE, m (path)", "mean AOE, rad",
         "ALE against published", "median predict, ms", "worst p99, ms", "all constraints kept",
     )  # fmt: skip
-    return tables.html_table(headings, lines, range(1, 9))
+    return html_table(headings, lines, range(1, 9))
 
 
 def _against_published(cases: Iterable[Result]) -> str:
@@ -240,7 +241,7 @@ def comparison(cases: Sequence[Result]) -> str:
             "the path. Several seeds (×n): mean ± 95 % interval by the t-distribution."
         )
     ]
-    for setting, text in tables.html_tables(cases).items():
+    for setting, text in html_tables(cases).items():
         parts.append(f"<h3>{html.escape(setting)}</h3>\n{text}")
     return "\n".join(parts)
 
@@ -325,7 +326,7 @@ def constraint_section(cases: Sequence[Result], drives: Sequence[Drive], styles:
     ]
     if lines:
         parts.append(
-            tables.html_table(
+            html_table(
                 ("vehicle", "limit on |vy|/vx", "curvature limit at low speed, 1/m"), lines, (1, 2)
             )
         )
@@ -391,7 +392,7 @@ def _limit_table(cases: Iterable[Result], drives: Mapping[Any, Drive]) -> str:
         "setting", "path", "agent", "seed", "largest excess, m/s", "periods over, %",
         "largest slack, m/s", "needed, %", "at the limit, m", "MLE, m",
     )  # fmt: skip
-    return tables.html_table(headings, lines, range(3, 10))
+    return html_table(headings, lines, range(3, 10))
 
 
 def _limit_lengths(drive: Drive) -> tuple[str, str]:
@@ -417,7 +418,7 @@ def failure_section(cases: Iterable[Result]) -> str:
         ]
         for case in cases
     ]  # fmt: skip
-    return tables.html_table(("id", "agent", "path", "setting", "seed", "error"), lines)
+    return html_table(("id", "agent", "path", "setting", "seed", "error"), lines)
 
 
 def warning_section(cases: Iterable[Result]) -> str:
@@ -426,7 +427,7 @@ def warning_section(cases: Iterable[Result]) -> str:
     if not counts:
         return ""
     lines = [[text, str(count)] for text, count in sorted(counts.items())]
-    return tables.html_table(("warning", "cases"), lines, (1,))
+    return html_table(("warning", "cases"), lines, (1,))
 
 
 def errata_section() -> str:
@@ -449,7 +450,7 @@ def manifest_section(manifest: Mapping[str, Any], cases: Sequence[Result]) -> st
         ]
     else:
         parts.append(paragraph("The folder has no readable manifest.json.", "bad"))
-    parts.append(tables.html_table(("entry", "value"), lines))
+    parts.append(html_table(("entry", "value"), lines))
     return "\n".join(parts)
 
 

@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from experiments import figures, published, tables
+from experiments.console_tables import console_table
 from experiments.report import write_report
 from experiments.report_page import ERRATA
 from experiments.results import ResultStore
@@ -211,7 +212,7 @@ def test_raw_trajectories_stand_beside_the_published_row_and_others_beside_none(
 def printed(results, width=120):
     console = Console(width=width, record=True, color_system=None, file=None, quiet=False)
     with console.capture() as captured:
-        console.print(tables.console_table(results))
+        console.print(console_table(results))
     return captured.get()
 
 
