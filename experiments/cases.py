@@ -149,7 +149,7 @@ def project_digest() -> str:
     here = Path(__file__).parent
     own = "".join(
         (here / name).read_text()
-        for name in ("cases.py", "rollout.py", "metrics.py", "computing.py")
+        for name in ("cases.py", "rollout.py", "metrics.py", "band_metrics.py", "computing.py")
     )
     return hashlib.sha256((source_digest(*folders) + own).encode()).hexdigest()[:16]
 
