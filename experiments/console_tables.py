@@ -7,6 +7,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from experiments.curvature_table import console_curvature
+from experiments.learning_table import console_learning
 from experiments.tables import (
     EFFORT,
     PUBLISHED_NOTE,
@@ -15,15 +17,25 @@ from experiments.tables import (
     Row,
     build_rows,
     by_setting,
+    cases_by_setting,
+    current,
+    ordered,
 )
 
 
 def console_table(cases: Iterable[Result]) -> RenderableType:
-    """Two tables a setting for a terminal of 120 columns: tracking, and what it took."""
+    """Three tables a setting for a terminal of 120 columns: tracking, what it took, by curvature.
+
+    Then a line for each learned policy: what learning cost.
+    """
+    kept = ordered(current(cases))
+    groups = cases_by_setting(kept)
     parts: list[RenderableType] = []
-    for setting, rows in by_setting(build_rows(cases)).items():
-        parts += [_console_tracking(setting, rows), _console_effort(rows), Text()]
-    return Group(*parts, Text(PUBLISHED_NOTE, style="dim"))
+    for setting, rows in by_setting(build_rows(kept)).items():
+        curvature = console_curvature(groups[setting])
+        parts += [_console_tracking(setting, rows), _console_effort(rows)]
+        parts += [Text()] if curvature is None else [curvature, Text()]
+    return Group(*parts, *console_learning(kept), Text(PUBLISHED_NOTE, style="dim"))
 
 
 def _console_start(title: str | None = None) -> Table:

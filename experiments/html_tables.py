@@ -69,14 +69,23 @@ def html_rows(
     )
 
 
+def _trained(row: Row) -> str:
+    """What learning cost, each quantity with its unit in one line."""
+    told = ", ".join(part.replace(" ", "\u00a0") for part in row.learning.split(", "))
+    return told or ("" if row.published else "–")
+
+
 def html_tables(cases: Iterable[Result]) -> dict[str, str]:
     """Per setting the tables of a report: tracking, what it took, and what the paper leaves out."""
     result = {}
     for setting, rows in by_setting(build_rows(cases)).items():
         ours = [row for row in rows if not row.published]
+        texts: dict[str, Callable[[Row], str]] = {"end": lambda row: row.end}
+        if any(row.learning for row in rows):
+            texts["trained"] = _trained
         result[setting] = "\n".join(
             [
-                html_rows(rows, TRACKING, {"end": lambda row: row.end}),
+                html_rows(rows, TRACKING, texts),
                 "<h4>Effort and constraints</h4>",
                 html_rows(
                     ours,

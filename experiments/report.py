@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from experiments import figures, published, tables
+from experiments.curvature_table import curvature_section
 from experiments.figures import Drive, Panel, Styles
 from experiments.html_tables import html_table, html_tables
+from experiments.learning_table import TRAINED_NOTE, learning_section
 from experiments.report_page import ERRATA, PAGE
 from experiments.results import ResultStore
 from trajectories.atomic import write_atomically
@@ -61,6 +63,8 @@ def build(cases: Sequence[Result], store: ResultStore) -> str:
     sections = {
         "Summary": summary(kept, len(cases) - len(kept)),
         "Against the published table": comparison(kept),
+        "By curvature": curvature_section(kept),
+        "What learning cost": learning_section(kept),
         "Figures": figure_section(drives, styles, missing),
         "Where the sideslip limit forbids the path": constraint_section(kept, drives, styles),
         **({"Failed cases": failure_section(failed)} if failed else {}),
@@ -160,7 +164,7 @@ def summary(cases: Sequence[Result], superseded: int) -> str:
                 "run again from other sources."
             )
         )
-    for setting, group in _cases_by_setting(cases).items():
+    for setting, group in tables.cases_by_setting(cases).items():
         parts.append(f"<h3>{html.escape(setting)}</h3>")
         parts.append(key_figures(group))
     parts.append(
@@ -172,13 +176,6 @@ def summary(cases: Sequence[Result], superseded: int) -> str:
         )
     )
     return "\n".join(parts)
-
-
-def _cases_by_setting(cases: Iterable[Result]) -> dict[str, list[Result]]:
-    groups: dict[str, list[Result]] = {}
-    for case in cases:
-        groups.setdefault(tables.setting_of(case), []).append(case)
-    return groups
 
 
 def _too_slow(case: Result) -> bool:
@@ -241,6 +238,8 @@ def comparison(cases: Sequence[Result]) -> str:
             "the path. Several seeds (×n): mean ± 95 % interval by the t-distribution."
         )
     ]
+    if any(case.get("training") for case in cases):
+        parts.append(paragraph(TRAINED_NOTE))
     for setting, text in html_tables(cases).items():
         parts.append(f"<h3>{html.escape(setting)}</h3>\n{text}")
     return "\n".join(parts)

@@ -17,6 +17,7 @@ import agents
 import trajectories
 from experiments import published
 from experiments.cases import Case
+from experiments.learning_words import words
 
 Result = Mapping[str, Any]
 
@@ -117,6 +118,7 @@ class Row:
     end: str = ""
     failures: str = ""
     violations: str = ""
+    learning: str = ""
     runs: int = 0
 
 
@@ -270,6 +272,12 @@ def _end_words(cases: Sequence[Result]) -> str:
     return ", ".join(f"{count} {end}" for end, count in ends.items())
 
 
+def _learning_words(cases: Iterable[Result]) -> str:
+    """What learning cost; "" for agents designed by hand, and where results do not tell."""
+    told = [words(case["training"]) for case in cases if case.get("training")]
+    return "; ".join(dict.fromkeys(told))
+
+
 def _agent_row(setting: str, trajectory: str, label: str, cases: Sequence[Result]) -> Row:
     done = [case for case in cases if case.get("status") == "ok"]
     values = {}
@@ -286,6 +294,7 @@ def _agent_row(setting: str, trajectory: str, label: str, cases: Sequence[Result
         end=_end_words(cases),
         failures=_failure_words(done) if done else "–",
         violations=_violation_words([case["metrics"] for case in done]) if done else "–",
+        learning=_learning_words(cases),
         runs=len(done),
     )
 
@@ -312,4 +321,12 @@ def by_setting(rows: Iterable[Row]) -> dict[str, list[Row]]:
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row.setting, []).append(row)
+    return groups
+
+
+def cases_by_setting(cases: Iterable[Result]) -> dict[str, list[Result]]:
+    """Cases by their setting, in order."""
+    groups: dict[str, list[Result]] = {}
+    for case in cases:
+        groups.setdefault(setting_of(case), []).append(case)
     return groups
