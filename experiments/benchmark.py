@@ -19,10 +19,10 @@ from rich.progress import (
 
 from experiments import engines
 from experiments.cases import Case
+from experiments.console_tables import console_table
 from experiments.interrupts import Interrupts
 from experiments.report import write_report
 from experiments.results import ResultStore
-from experiments.tables import console_table
 
 Spec = Mapping[str, Any]
 

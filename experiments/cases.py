@@ -18,7 +18,7 @@ import agents
 import lpv_track_env
 import trajectories
 from agents.registry import check_settings, source_file
-from experiments import metrics
+from experiments import learning_cost, metrics
 from experiments.computing import ComputingTimes
 from experiments.rollout import Rollout, rollout
 from lpv_track_env import conditions, plants, vehicle
@@ -147,10 +147,8 @@ def project_digest() -> str:
     packages = (trajectories, lpv_track_env, agents)
     folders = [Path(str(package.__file__)).parent for package in packages]
     here = Path(__file__).parent
-    own = "".join(
-        (here / name).read_text()
-        for name in ("cases.py", "rollout.py", "metrics.py", "computing.py")
-    )
+    names = ("cases", "rollout", "metrics", "band_metrics", "computing", "learning_cost")
+    own = "".join((here / f"{name}.py").read_text() for name in names)
     return hashlib.sha256((source_digest(*folders) + own).encode()).hexdigest()[:16]
 
 
@@ -167,7 +165,7 @@ def run_case(spec: Mapping[str, Any]) -> dict[str, Any]:
     dict
         `id`, the spec's fields, `status` ("ok" or "failed" with `error`), `end`, `metrics`,
         `solver` (median, p99, max time in s; failures), `warnings`, `seconds`, and `trace`, arrays
-        by name.
+        by name; for a learned policy `training`, what it cost (`experiments.learning_cost`).
     """
     case = Case(**spec)
     result: dict[str, Any] = {"id": case.id, **case.as_dict(), "status": "ok", "end": None}
@@ -177,7 +175,9 @@ def run_case(spec: Mapping[str, Any]) -> dict[str, Any]:
             warnings.simplefilter("always", UserWarning)
             env = case.make_env()
             computing = case.make_computing()
-            driven = rollout(env, case.make_agent(env), seed=case.seed, computing_time=computing)
+            agent = case.make_agent(env)
+            result |= learning_cost.of_agent(agent)
+            driven = rollout(env, agent, seed=case.seed, computing_time=computing)
             car = env.unwrapped.vehicle  # type: ignore[attr-defined]
             env.close()
         measured = metrics.evaluate(driven.trace, driven.path, car)

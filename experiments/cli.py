@@ -23,9 +23,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace, console: Any) -> int:
+    from experiments.console_tables import console_table
     from experiments.report import write_report
     from experiments.results import ResultStore
-    from experiments.tables import console_table
 
     if not options.folder.is_dir():
         raise ValueError(f"{options.folder} is not a folder of results")

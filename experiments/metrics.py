@@ -18,6 +18,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.band_metrics import by_band
 from experiments.rollout import Trace
 from lpv_track_env.bicycle import VX, VY, X, Y, derivative
 from lpv_track_env.vehicle import VehicleParameters
@@ -136,6 +137,7 @@ def knowledge(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> 
 
 METRICS: tuple[Callable[[Trace, ReferencePath, VehicleParameters], dict[str, float]], ...] = (
     tracking,
+    by_band,
     activity,
     violations,
     knowledge,

@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 
 from experiments import figures, published, tables
+from experiments.curvature_table import curvature_section
 from experiments.figures import Drive, Panel, Styles
+from experiments.html_tables import html_table, html_tables
+from experiments.learning_table import TRAINED_NOTE, learning_section
 from experiments.report_page import ERRATA, PAGE
 from experiments.results import ResultStore
 from trajectories.atomic import write_atomically
@@ -60,6 +63,8 @@ def build(cases: Sequence[Result], store: ResultStore) -> str:
     sections = {
         "Summary": summary(kept, len(cases) - len(kept)),
         "Against the published table": comparison(kept),
+        "By curvature": curvature_section(kept),
+        "What learning cost": learning_section(kept),
         "Figures": figure_section(drives, styles, missing),
         "Where the sideslip limit forbids the path": constraint_section(kept, drives, styles),
         **({"Failed cases": failure_section(failed)} if failed else {}),
@@ -159,7 +164,7 @@ def summary(cases: Sequence[Result], superseded: int) -> str:
                 "run again from other sources."
             )
         )
-    for setting, group in _cases_by_setting(cases).items():
+    for setting, group in tables.cases_by_setting(cases).items():
         parts.append(f"<h3>{html.escape(setting)}</h3>")
         parts.append(key_figures(group))
     parts.append(
@@ -171,13 +176,6 @@ def summary(cases: Sequence[Result], superseded: int) -> str:
         )
     )
     return "\n".join(parts)
-
-
-def _cases_by_setting(cases: Iterable[Result]) -> dict[str, list[Result]]:
-    groups: dict[str, list[Result]] = {}
-    for case in cases:
-        groups.setdefault(tables.setting_of(case), []).append(case)
-    return groups
 
 
 def _too_slow(case: Result) -> bool:
@@ -215,7 +213,7 @@ def key_figures(cases: Sequence[Result]) -> str:
         "agent", "whole path", "mean ALE, m", "worst MLE, m (path)", "mean AOE, rad",
         "ALE against published", "median predict, ms", "worst p99, ms", "all constraints kept",
     )  # fmt: skip
-    return tables.html_table(headings, lines, range(1, 9))
+    return html_table(headings, lines, range(1, 9))
 
 
 def _against_published(cases: Iterable[Result]) -> str:
@@ -240,7 +238,9 @@ def comparison(cases: Sequence[Result]) -> str:
             "the path. Several seeds (×n): mean ± 95 % interval by the t-distribution."
         )
     ]
-    for setting, text in tables.html_tables(cases).items():
+    if any(case.get("training") for case in cases):
+        parts.append(paragraph(TRAINED_NOTE))
+    for setting, text in html_tables(cases).items():
         parts.append(f"<h3>{html.escape(setting)}</h3>\n{text}")
     return "\n".join(parts)
 
@@ -325,7 +325,7 @@ def constraint_section(cases: Sequence[Result], drives: Sequence[Drive], styles:
     ]
     if lines:
         parts.append(
-            tables.html_table(
+            html_table(
                 ("vehicle", "limit on |vy|/vx", "curvature limit at low speed, 1/m"), lines, (1, 2)
             )
         )
@@ -391,7 +391,7 @@ def _limit_table(cases: Iterable[Result], drives: Mapping[Any, Drive]) -> str:
         "setting", "path", "agent", "seed", "largest excess, m/s", "periods over, %",
         "largest slack, m/s", "needed, %", "at the limit, m", "MLE, m",
     )  # fmt: skip
-    return tables.html_table(headings, lines, range(3, 10))
+    return html_table(headings, lines, range(3, 10))
 
 
 def _limit_lengths(drive: Drive) -> tuple[str, str]:
@@ -417,7 +417,7 @@ def failure_section(cases: Iterable[Result]) -> str:
         ]
         for case in cases
     ]  # fmt: skip
-    return tables.html_table(("id", "agent", "path", "setting", "seed", "error"), lines)
+    return html_table(("id", "agent", "path", "setting", "seed", "error"), lines)
 
 
 def warning_section(cases: Iterable[Result]) -> str:
@@ -426,7 +426,7 @@ def warning_section(cases: Iterable[Result]) -> str:
     if not counts:
         return ""
     lines = [[text, str(count)] for text, count in sorted(counts.items())]
-    return tables.html_table(("warning", "cases"), lines, (1,))
+    return html_table(("warning", "cases"), lines, (1,))
 
 
 def errata_section() -> str:
@@ -449,7 +449,7 @@ def manifest_section(manifest: Mapping[str, Any], cases: Sequence[Result]) -> st
         ]
     else:
         parts.append(paragraph("The folder has no readable manifest.json.", "bad"))
-    parts.append(tables.html_table(("entry", "value"), lines))
+    parts.append(html_table(("entry", "value"), lines))
     return "\n".join(parts)
 
 

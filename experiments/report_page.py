@@ -68,7 +68,7 @@ table { border-collapse: collapse; font-size: 0.875rem; font-variant-numeric: ta
 th, td { padding: 0.25rem 0.65rem; text-align: left; vertical-align: baseline;
   border-bottom: 1px solid var(--line); overflow-wrap: break-word; }
 thead th { vertical-align: bottom; font-weight: 600; border-bottom: 2px solid var(--line); }
-thead small { display: block; font-weight: 400; }
+thead small, td small { display: block; font-weight: 400; }
 td.n, th.n { text-align: right; white-space: nowrap; }
 thead th.n { white-space: normal; }
 td.who { white-space: nowrap; }

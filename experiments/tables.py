@@ -1,27 +1,23 @@
-"""The paper's table from results: one source of rows, drawn for a terminal and for HTML.
+"""The paper's table from results: the rows, which `console_tables` and `html_tables` draw.
 
 Cases are grouped by setting (vehicle, speed mode and whatever else of a case is not the default)
 and trajectory. A group's first row is the published one (kumar2025lpv, simulation), then one row
 per agent; several seeds become a mean and a 95 % interval of it by the t-distribution.
 """
 
-import html
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
 from scipy.stats import t as student
 
 import agents
 import trajectories
 from experiments import published
 from experiments.cases import Case
+from experiments.learning_words import words
 
 Result = Mapping[str, Any]
 
@@ -122,6 +118,7 @@ class Row:
     end: str = ""
     failures: str = ""
     violations: str = ""
+    learning: str = ""
     runs: int = 0
 
 
@@ -275,6 +272,12 @@ def _end_words(cases: Sequence[Result]) -> str:
     return ", ".join(f"{count} {end}" for end, count in ends.items())
 
 
+def _learning_words(cases: Iterable[Result]) -> str:
+    """What learning cost; "" for agents designed by hand, and where results do not tell."""
+    told = [words(case["training"]) for case in cases if case.get("training")]
+    return "; ".join(dict.fromkeys(told))
+
+
 def _agent_row(setting: str, trajectory: str, label: str, cases: Sequence[Result]) -> Row:
     done = [case for case in cases if case.get("status") == "ok"]
     values = {}
@@ -291,6 +294,7 @@ def _agent_row(setting: str, trajectory: str, label: str, cases: Sequence[Result
         end=_end_words(cases),
         failures=_failure_words(done) if done else "–",
         violations=_violation_words([case["metrics"] for case in done]) if done else "–",
+        learning=_learning_words(cases),
         runs=len(done),
     )
 
@@ -320,150 +324,9 @@ def by_setting(rows: Iterable[Row]) -> dict[str, list[Row]]:
     return groups
 
 
-def console_table(cases: Iterable[Result]) -> RenderableType:
-    """Two tables a setting for a terminal of 120 columns: tracking, and what it took."""
-    parts: list[RenderableType] = []
-    for setting, rows in by_setting(build_rows(cases)).items():
-        parts += [_console_tracking(setting, rows), _console_effort(rows), Text()]
-    return Group(*parts, Text(PUBLISHED_NOTE, style="dim"))
-
-
-def _console_start(title: str | None = None) -> Table:
-    table = Table(
-        title=Text(title) if title else None, title_justify="left", title_style="bold",
-        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False,
-    )  # fmt: skip
-    table.add_column("path", no_wrap=True, min_width=4, max_width=18, overflow="ellipsis")
-    table.add_column("agent", min_width=16, max_width=26, overflow="fold")
-    return table
-
-
-def _console_lines(
-    table: Table, rows: Sequence[Row], cells: Callable[[Row], Sequence[str]]
-) -> Table:
-    """Add rows; the trajectory is named once and its group closed by a blank line."""
-    seen = ""
-    for place, row in enumerate(rows):
-        last = place + 1 == len(rows) or rows[place + 1].trajectory != row.trajectory
-        name = "" if row.trajectory == seen else row.trajectory
-        seen = row.trajectory
-        table.add_row(
-            Text(name, style="bold"),
-            *(Text(cell) for cell in (row.label, *cells(row))),
-            style="italic dim" if row.published else "",
-            end_section=last,
-        )
-    return table
-
-
-def _console_tracking(setting: str, rows: Sequence[Row]) -> Table:
-    table = _console_start(setting)
-    for column in TRACKING:
-        table.add_column(f"{column.heading}\n{column.unit}", justify="right", no_wrap=True)
-    table.add_column("end", max_width=18)
-    return _console_lines(
-        table,
-        rows,
-        lambda row: [
-            *(column.text(row, "\n") for column in TRACKING),
-            row.end,
-        ],
-    )
-
-
-def _console_effort(rows: Sequence[Row]) -> Table:
-    table = _console_start()
-    for column in EFFORT:
-        heading = column.heading.replace(" ", "\n", 1)
-        table.add_column(f"{heading}\n{column.unit}", justify="right", no_wrap=True)
-    table.add_column("solves\nfailed", justify="right", max_width=11)
-    table.add_column("constraints broken: largest excess,\nshare of periods", ratio=1)
-    return _console_lines(
-        table,
-        [row for row in rows if not row.published],
-        lambda row: [
-            *(column.text(row, "\n") for column in EFFORT),
-            row.failures,
-            row.violations,
-        ],
-    )
-
-
-def html_table(
-    headings: Sequence[str], lines: Iterable[Sequence[str]], numeric: Iterable[int] = ()
-) -> str:
-    """A plain HTML table from text cells, all escaped; columns `numeric` are aligned right."""
-    right = set(numeric)
-
-    def cell(tag: str, place: int, text: str) -> str:
-        kind = ' class="n"' if place in right else ""
-        return f"<{tag}{kind}>{html.escape(text)}</{tag}>"
-
-    head = "".join(cell("th", place, text) for place, text in enumerate(headings))
-    body = "\n".join(
-        "<tr>" + "".join(cell("td", place, text) for place, text in enumerate(line)) + "</tr>"
-        for line in lines
-    )
-    return (
-        f'<div class="wide" tabindex="0"><table><thead><tr>{head}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody></table></div>"
-    )
-
-
-def html_rows(
-    rows: Sequence[Row], columns: Sequence[Column], texts: Mapping[str, Callable[[Row], str]]
-) -> str:
-    """HTML table of one setting's rows: trajectory, agent, numeric columns, columns of text."""
-    heads = "".join(
-        f'<th class="n">{html.escape(column.heading)} '
-        f"<small>{html.escape(column.unit)}</small></th>"
-        for column in columns
-    ) + "".join(f"<th>{html.escape(heading)}</th>" for heading in texts)
-    lines = []
-    seen = ""
-    for row in rows:
-        first = row.trajectory != seen
-        seen = row.trajectory
-        classes = " ".join(
-            name for name, on in (("published", row.published), ("first", first)) if on
-        )
-        cells = "".join(
-            f'<td class="n">{html.escape(column.text(row))}</td>' for column in columns
-        ) + "".join(f'<td class="t">{html.escape(words(row))}</td>' for words in texts.values())
-        name = html.escape(row.trajectory) if first else ""
-        label = html.escape(row.label + (f" ×{row.runs}" if row.runs > 1 else ""))
-        lines.append(
-            f'<tr class="{classes}"><th scope="row">{name}</th><td class="who">{label}</td>'
-            f"{cells}</tr>"
-        )
-    body = "\n".join(lines)
-    return (
-        f'<div class="wide" tabindex="0"><table class="grouped"><thead><tr><th>path</th>'
-        f"<th>agent</th>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>"
-    )
-
-
-def html_tables(cases: Iterable[Result]) -> dict[str, str]:
-    """Per setting the tables of a report: tracking, what it took, and what the paper leaves out."""
-    result = {}
-    for setting, rows in by_setting(build_rows(cases)).items():
-        ours = [row for row in rows if not row.published]
-        result[setting] = "\n".join(
-            [
-                html_rows(rows, TRACKING, {"end": lambda row: row.end}),
-                "<h4>Effort and constraints</h4>",
-                html_rows(
-                    ours,
-                    EFFORT,
-                    {
-                        "solves failed": lambda row: row.failures,
-                        "constraints broken: largest excess, share of control periods": (
-                            lambda row: row.violations
-                        ),
-                    },
-                ),
-                "<h4>Beyond the paper's columns</h4>",
-                html_rows(ours, FURTHER, {}),
-            ]
-        )
-    return result
+def cases_by_setting(cases: Iterable[Result]) -> dict[str, list[Result]]:
+    """Cases by their setting, in order."""
+    groups: dict[str, list[Result]] = {}
+    for case in cases:
+        groups.setdefault(setting_of(case), []).append(case)
+    return groups

@@ -1,0 +1,132 @@
+"""Errors by the path's curvature: one table a setting, for the report and for a terminal."""
+
+import html
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from experiments.band_metrics import BANDS
+from experiments.tables import Estimate, Result, cases_by_setting, estimate, label_of, labels
+
+NOTE = (
+    "ALE, m, where the path's |curvature| at the foot point is in the band: mean over the drives "
+    "that came there, on all paths and with all seeds of the setting, each with the same weight, "
+    "± 95 % interval by the t-distribution. Drives of one seed share their disturbances: over "
+    "several paths the interval is rather too narrow. Below it the number of drives, and the "
+    "band's share of the time that the agent drove; who leaves the road early sees less of the "
+    "path. The largest lateral and the rms heading error by band are in cases.jsonl."
+)
+DECIMALS = 3
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One agent in one band: ALE (m) over the drives that came there, and how long they stayed."""
+
+    ale: Estimate
+    drives: int
+    share: float
+    """Of all time that the agent drove in the setting, 0 to 1."""
+
+    @property
+    def error(self) -> str:
+        """ALE with its interval."""
+        mean = f"{self.ale.mean:.{DECIMALS}f}"
+        width = self.ale.half_width
+        return mean if width is None else f"{mean} ±{width:.{DECIMALS}f}"
+
+    @property
+    def basis(self) -> str:
+        """What that is made of."""
+        share = f"{100 * self.share:.0f}" if self.share >= 5e-3 else "<1"
+        return f"{self.drives} drive{'s' * (self.drives != 1)}, {share} %"
+
+
+Line = tuple[str, list[Cell | None]]
+"""An agent's label, and a cell for each band; None where no drive came there."""
+
+
+def band_lines(cases: Sequence[Result]) -> list[Line]:
+    """Lines of one setting, its agents in the tables' order; none where no case knows bands."""
+    lines = []
+    for label in labels(cases):
+        measured = [
+            case["metrics"]
+            for case in cases
+            if label_of(case) == label
+            and any(f"ale_{name}" in case["metrics"] for name in BANDS.names)
+        ]
+        lines.append((label, [_cell(measured, name) for name in BANDS.names]))
+    return lines if any(cell for _, cells in lines for cell in cells) else []
+
+
+def _cell(measured: Sequence[Mapping[str, float]], name: str) -> Cell | None:
+    came = [metrics for metrics in measured if f"ale_{name}" in metrics]
+    if not came:
+        return None
+    total = sum(metrics["duration"] for metrics in measured)
+    stayed = sum(metrics[f"share_{name}"] * metrics["duration"] for metrics in came)
+    ale = estimate([metrics[f"ale_{name}"] for metrics in came])
+    return Cell(ale, len(came), stayed / total if total > 0.0 else 0.0)
+
+
+def band_ranges() -> list[str]:
+    """|curvature| of each band, 1/m, as words."""
+    edges = [f"{threshold:g}" for threshold in BANDS.thresholds]
+    between = [f"{low} to {high}" for low, high in pairwise(edges)]
+    return [f"< {edges[0]}", *between, f"≥ {edges[-1]}"]
+
+
+def curvature_section(cases: Iterable[Result]) -> str:
+    """HTML: a table for each setting; "" where no case knows bands."""
+    parts = []
+    for setting, group in cases_by_setting(cases).items():
+        if lines := band_lines(group):
+            parts.append(f"<h3>{html.escape(setting)}</h3>\n{_html(lines)}")
+    return "\n".join([f"<p>{html.escape(NOTE)}</p>", *parts]) if parts else ""
+
+
+def _html(lines: Iterable[Line]) -> str:
+    heads = "".join(
+        f'<th class="n">{html.escape(name)}<small>{html.escape(words)} 1/m</small></th>'
+        for name, words in zip(BANDS.names, band_ranges(), strict=True)
+    )
+    body = "\n".join(
+        f'<tr><td class="who">{html.escape(label)}</td>'
+        + "".join(
+            f'<td class="n">{cell.error}<small>{html.escape(cell.basis)}</small></td>'
+            if cell
+            else '<td class="n">–</td>'
+            for cell in cells
+        )
+        + "</tr>"
+        for label, cells in lines
+    )
+    return (
+        f'<div class="wide" tabindex="0"><table><thead><tr><th>agent</th>{heads}</tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def console_curvature(cases: Sequence[Result]) -> Table | None:
+    """Table of one setting for a terminal; None where no case knows bands."""
+    lines = band_lines(cases)
+    if not lines:
+        return None
+    table = Table(
+        title="ALE by curvature, m; drives, share of time", title_justify="left",
+        title_style="", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False,
+    )  # fmt: skip
+    table.add_column("agent", min_width=16, max_width=26, overflow="fold")
+    for name, words in zip(BANDS.names, band_ranges(), strict=True):
+        table.add_column(f"{name}\n{words} 1/m", justify="right", no_wrap=True)
+    for label, cells in lines:
+        table.add_row(
+            Text(label),
+            *(Text(f"{cell.error}\n{cell.basis}" if cell else "–") for cell in cells),
+        )
+    return table
