@@ -1,7 +1,7 @@
 """Errors by the path's curvature: one table a setting, for the report and for a terminal."""
 
 import html
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -13,12 +13,11 @@ from experiments.band_metrics import BANDS
 from experiments.tables import Estimate, Result, cases_by_setting, estimate, label_of, labels
 
 NOTE = (
-    "ALE, m, where the path's |curvature| at the foot point is in the band: mean over the drives "
-    "that came there, on all paths and with all seeds of the setting, each with the same weight, "
-    "± 95 % interval by the t-distribution. Drives of one seed share their disturbances: over "
-    "several paths the interval is rather too narrow. Below it the number of drives, and the "
-    "band's share of the time that the agent drove; who leaves the road early sees less of the "
-    "path. The largest lateral and the rms heading error by band are in cases.jsonl."
+    "ALE, m, where the path's |curvature| at the foot point is in the band: mean over seeds of the "
+    "mean over a seed's drives that came there, ± 95 % interval by the t-distribution over seeds, "
+    "since drives of one seed share their disturbances whatever the path. Below it the number of "
+    "drives, and the band's share of the time that the agent drove; who leaves the road early sees "
+    "less of the path. The largest lateral and the rms heading error by band are in cases.jsonl."
 )
 DECIMALS = 3
 
@@ -55,7 +54,7 @@ def band_lines(cases: Sequence[Result]) -> list[Line]:
     lines = []
     for label in labels(cases):
         measured = [
-            case["metrics"]
+            case
             for case in cases
             if label_of(case) == label
             and any(f"ale_{name}" in case["metrics"] for name in BANDS.names)
@@ -64,13 +63,16 @@ def band_lines(cases: Sequence[Result]) -> list[Line]:
     return lines if any(cell for _, cells in lines for cell in cells) else []
 
 
-def _cell(measured: Sequence[Mapping[str, float]], name: str) -> Cell | None:
-    came = [metrics for metrics in measured if f"ale_{name}" in metrics]
+def _cell(measured: Sequence[Result], name: str) -> Cell | None:
+    came = [case for case in measured if f"ale_{name}" in case["metrics"]]
     if not came:
         return None
-    total = sum(metrics["duration"] for metrics in measured)
-    stayed = sum(metrics[f"share_{name}"] * metrics["duration"] for metrics in came)
-    ale = estimate([metrics[f"ale_{name}"] for metrics in came])
+    total = sum(case["metrics"]["duration"] for case in measured)
+    stayed = sum(case["metrics"][f"share_{name}"] * case["metrics"]["duration"] for case in came)
+    by_seed: dict[int, list[float]] = {}
+    for case in came:
+        by_seed.setdefault(case["seed"], []).append(case["metrics"][f"ale_{name}"])
+    ale = estimate([sum(values) / len(values) for values in by_seed.values()])
     return Cell(ale, len(came), stayed / total if total > 0.0 else 0.0)
 
 

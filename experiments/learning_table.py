@@ -11,11 +11,11 @@ from experiments.learning_words import UNKNOWN, duration, words
 from experiments.tables import Result, label_of, labels
 
 NOTE = (
-    "Environment steps, wall time on the machine that trained, and NMPC solves for demonstrations "
-    "or for the base of a residual. All three count up to the checkpoint that was kept, the best "
-    "on the validation paths; the command goes on to its last step. The cost of a policy that "
-    "training started from (--from) is not in them. Agents that are not listed were designed by "
-    "hand; what that took was not recorded."
+    "Environment steps, wall time with validation on the machine that trained, and NMPC solves for "
+    "demonstrations or for the base of a residual: of the whole training, though what drives is "
+    "its checkpoint that was best on the validation paths, and of the one that it started from "
+    "(--from), if any. Agents that are not listed were designed by hand; what that took was not "
+    "recorded."
 )
 TRAINED_NOTE = (
     "Trained: environment steps, wall time and NMPC solves that learning took; “–” for agents "

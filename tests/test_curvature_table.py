@@ -27,7 +27,13 @@ def three_drives(agent="stanley", first=1):
     return [
         case(first, agent, seed=0, metrics=bands(straight=(0.1, 0.75), sharp=(0.3, 0.25))),
         case(first + 1, agent, seed=1, metrics=bands(straight=(0.2, 0.5), sharp=(0.5, 0.5))),
-        case(first + 2, agent, "T6", metrics={**bands(straight=(0.6, 1.0)), "duration": 120.0}),
+        case(
+            first + 2,
+            agent,
+            "T6",
+            seed=2,
+            metrics={**bands(straight=(0.6, 1.0)), "duration": 120.0},
+        ),
     ]
 
 
@@ -58,6 +64,22 @@ def test_all_agents_stand_in_the_order_of_the_main_table_whatever_they_drove():
     assert dict(lines)["pid"] == [None] * 4
     assert dict(lines)["mine:Own"][1:] == [None] * 3
     assert dict(lines)["mine:Own"][0].ale.half_width is None
+
+
+def test_drives_of_one_seed_are_one_sample():
+    """They share their disturbances, whatever the path."""
+    paths = [("T1", 0, 0.1), ("T2", 0, 0.3), ("T1", 1, 0.5), ("T2", 1, 0.7)]
+    cases = [
+        case(k, trajectory=path, seed=seed, metrics=bands(sharp=(ale, 1.0)))
+        for k, (path, seed, ale) in enumerate(paths)
+    ]
+    ((_, cells),) = band_lines(cases)
+    assert cells[3].drives == 4
+    assert cells[3].ale.mean == pytest.approx(0.4)
+    # Means of 0.2 and 0.6; t_(0.975, 1) = 12.706.
+    assert cells[3].ale.half_width == pytest.approx(12.7062 * 0.4 / 2.0, rel=1e-4)
+    ((_, alone),) = band_lines(cases[:2])
+    assert alone[3].ale.half_width is None
 
 
 def test_drives_that_do_not_know_bands_count_neither_as_drives_nor_as_time():

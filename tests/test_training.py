@@ -320,7 +320,8 @@ def test_the_best_policy_on_validation_is_kept(tmp_path: Path) -> None:
     best = int(np.argmin(losses))
     policy = read_policy(tmp_path / "policy.json")
     assert policy.training["validation"]["loss"] == min(losses)
-    assert policy.training["steps"] == kept["lines"][best]["steps"]
+    assert policy.training["kept_at"] == kept["lines"][best]["steps"]
+    assert policy.training["steps"] == kept["lines"][-1]["steps"]
     assert [line["best"] for line in kept["lines"]][best]
     case = cases(tiny("bc"), tmp_path / "policy.json")[0]
     assert run_case(case)["metrics"]["ale"] >= 0.0

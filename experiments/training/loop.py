@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -144,28 +144,41 @@ def _judge(
     line: dict[str, Any],
     command: str,
 ) -> dict[str, Any]:
-    """Validate the policy as it is; it becomes the folder's if it is the best so far."""
-    candidate = folder / "candidate.json"
-    settings = trainer.settings
+    """Validate the policy as it is; it becomes the folder's if it is the best so far.
+
+    Whether it does or not, the folder's policy tells what all of the training has cost by now,
+    with that of the policy it started from.
+    """
+    settings, candidate, kept = trainer.settings, folder / "candidate.json", folder / POLICY
+    write_policy(trainer.policy({}), candidate)
+    judged = validate(settings, candidate)
+    for file in (candidate, candidate.with_suffix(".safetensors")):
+        file.unlink()
+    best = min((earlier["validation"]["loss"] for earlier in lines), default=float("inf"))
+    line = {**line, "validation": judged, "best": judged["loss"] < best}
+    names = path_names(settings)
+    found = {"kept_at": line["steps"], "validation": judged}
+    if not line["best"]:
+        before = read_policy(kept).training
+        found = {key: before[key] for key in found}
+    start = read_policy(Path(settings.start)).training if settings.start else {}
     training = {
         "command": command,
         "settings": settings.as_dict(),
-        "paths": [path_names(settings)[0], path_names(settings)[-1]],
-        "steps": line["steps"],
-        "solves": line["solves"],
-        "seconds": round(line["seconds"], 1),
+        "paths": [names[0], names[-1]],
+        "steps": line["steps"] + start.get("steps", 0),
+        "solves": line["solves"] + start.get("solves", 0),
+        "seconds": round(line["seconds"] + start.get("seconds", 0.0), 1),
+        "start": start.get("command"),
+        **found,
         "versions": versions(),
         "revision": revision(),
         "hardware": hardware(),
     }
-    write_policy(trainer.policy(training), candidate)
-    judged = validate(settings, candidate)
-    best = min((earlier["validation"]["loss"] for earlier in lines), default=float("inf"))
-    line = {**line, "validation": judged, "best": judged["loss"] < best}
-    if line["best"]:
-        write_policy(trainer.policy({**training, "validation": judged}), folder / POLICY)
-    for file in (candidate, candidate.with_suffix(".safetensors")):
-        file.unlink()
+    policy = (
+        trainer.policy(training) if line["best"] else replace(read_policy(kept), training=training)
+    )
+    write_policy(policy, kept)
     return line
 
 
