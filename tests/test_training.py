@@ -30,6 +30,7 @@ from experiments.training.seeds import (
 from experiments.training.settings import (
     ALGORITHMS,
     HYPERPARAMETERS,
+    REWARD,
     TrainingSettings,
     difference,
     usual,
@@ -184,7 +185,8 @@ def test_cloning_learns_to_drive(tmp_path: Path) -> None:
 def test_ppo_learns_to_drive_from_nothing(tmp_path: Path) -> None:
     settings = usual(
         "ppo", steps=1_000_000, segment=1_000_000, envs=256, paths=4, validation=1,
-        conditions=("simulation",), hyperparameters={"batch": 2048, "last_learning_rate": 3e-4},
+        conditions=("simulation",), reward={**REWARD, "lateral_scale": 0.1},
+        hyperparameters={"batch": 2048, "last_learning_rate": 3e-4},
     )  # fmt: skip
     lines = train(settings, tmp_path, SILENT, command="test")
     assert lines[-1]["validation"]["finished"] == 1.0

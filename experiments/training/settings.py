@@ -51,9 +51,13 @@ FAST: dict[str, Any] = {
 """`--fast` of PPO: perfect knowledge only, and few, large updates."""
 
 REWARD = {
-    "lateral_scale": 0.05, "heading": 0.1, "speed_scale": 0.5, "input_rate": 0.2,
+    "lateral_scale": 0.02, "heading": 0.1, "speed_scale": 0.5, "input_rate": 0.2,
 }  # fmt: skip
-"""Of `RewardWeights`, in training: the environment's own scale of 0.5 m is too wide for it."""
+"""Of `RewardWeights`, in training: centimetres count, which the environment's own 0.5 m hides.
+
+With 0.05 m, PPO ends at twice the error in simulation; with 0.02 m it takes longer to stay on the
+road at first.
+"""
 
 
 @dataclass(frozen=True)
