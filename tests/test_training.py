@@ -296,6 +296,7 @@ def test_the_command_trains_resumes_and_refuses(
         (["--steps", "0.5"], "whole number"), (["--hours", "-1"], "--hours"),
         (["--trajectories", "T1"], "evaluation"), (["--fast"], "ppo"),
         (["--set", "rounds=3"], "round"), (["--from", "none.json"], "none.json"),
+        (["--device", "abacus"], "--device cpu"), (["--device", "cuda:99"], "--device cpu"),
         (["--conditions-set", "friction=0.5"], "--conditions"),
     ):  # fmt: skip
         assert command(*words[:-1], str(tmp_path / "other"), *bad) == 2, bad

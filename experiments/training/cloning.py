@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.utils import get_device
 
 from agents.learned.learner import LearnerVecEnv
 from agents.learned.policy import Policy
@@ -43,7 +44,8 @@ class CloningTrainer(Trainer):
         parts: list[torch.nn.Module] = []
         for layer in self._linear:
             parts += [layer, ACTIVATIONS[self.hyper["activation"]]()]
-        self._net = torch.nn.Sequential(*parts[:-1])
+        self._device = get_device(settings.device)
+        self._net = torch.nn.Sequential(*parts[:-1]).to(self._device)
         if start is not None:
             check_start(start, settings, env.scaling, squash="clip")
             put_layers(start.layers, self._linear)
@@ -104,17 +106,19 @@ class CloningTrainer(Trainer):
 
     def _outputs(self, features: Array) -> Array:
         with torch.no_grad():
-            outputs: Array = self._net(torch.from_numpy(features)).numpy()
+            outputs: Array = self._net(torch.from_numpy(features).to(self._device)).cpu().numpy()
         return outputs
 
     def _fit(self) -> float:
         """Adam on samples of everything said so far; the mean loss of the last tenth."""
         for group in self._optimiser.param_groups:
             group["lr"] = self.rate()
-        inputs, targets = torch.from_numpy(self._asked), torch.from_numpy(self._said)
+        inputs, targets = (
+            torch.from_numpy(values).to(self._device) for values in (self._asked, self._said)
+        )
         updates, losses = self.hyper["updates"], []
         for _ in range(updates):
-            rows = torch.randint(len(inputs), (self.hyper["batch"],))
+            rows = torch.randint(len(inputs), (self.hyper["batch"],), device=self._device)
             loss = torch.nn.functional.mse_loss(self._net(inputs[rows]), targets[rows])
             self._optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
@@ -141,7 +145,7 @@ class CloningTrainer(Trainer):
         """The policy as it is."""
         scaling = self.env.scaling
         layers = tuple(
-            (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
+            (layer.weight.detach().cpu().numpy().copy(), layer.bias.detach().cpu().numpy().copy())
             for layer in self._linear
         )
         return Policy(

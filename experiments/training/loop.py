@@ -45,12 +45,23 @@ def make_trainer(settings: TrainingSettings, paths: list[Any], logger: Logger) -
     Raises
     ------
     ValueError
-        If there is a policy to start from and it does not fit.
+        If there is a policy to start from and it does not fit, or the device is not there.
     """
     torch.set_num_threads(1)
+    _check_device(settings.device)
     start = read_policy(Path(settings.start)) if settings.start else None
     kind = CloningTrainer if settings.algorithm == "bc" else Sb3Trainer
     return kind(settings, make_learner_env(settings, paths), start, logger)
+
+
+def _check_device(name: str) -> None:
+    if name == "auto":
+        return
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"no device {name!r} here: say --device cpu or auto ({reason})") from None
 
 
 def has_training(folder: Path) -> bool:
