@@ -118,8 +118,8 @@ def _speed(add: Add) -> None:
     speed.add_argument("--out", type=Path, default=Path("results/speed"), metavar="DIR")
     speed.add_argument(
         "--only", nargs="+", default=[], metavar="SECTION",
-        help="default: all of single, vector, conditions, learning, solvers, horizons, batches, "
-        "wild, loops, memory, startup",
+        help="default: all of single, vector, conditions, learning, training, solvers, policies, "
+        "horizons, batches, wild, loops, memory, startup",
     )  # fmt: skip
     speed.add_argument("--quick", action="store_true", help="tiny: shows that it works, no more")
 

@@ -23,7 +23,16 @@ from rich.progress import (
 
 from experiments.interrupts import Interrupts
 from experiments.results import hardware, revision, versions
-from experiments.speed import environments, learning, loops, processes, solvers, tables, wild
+from experiments.speed import (
+    environments,
+    learning,
+    loops,
+    policies,
+    processes,
+    solvers,
+    tables,
+    wild,
+)
 from experiments.speed.figures import picture
 from experiments.speed.measure import FULL, QUICK, Effort, Section, Tick
 from lpv_track_env.naming import choose
@@ -37,7 +46,9 @@ SECTIONS: dict[str, tuple[str, Measure]] = {
     "vector": ("Environments stepped together", environments.vector),
     "conditions": ("The same under the conditions of a real vehicle", environments.conditions),
     "learning": ("Share of PPO's time that the environments take", learning.learning),
+    "training": ("PPO at its fast setting", policies.training),
     "solvers": ("NMPC solvers on the same observations", solvers.solvers),
+    "policies": ("Learned policies beside the NMPC", policies.policies),
     "horizons": ("NMPC solvers over the horizon", solvers.horizons),
     "batches": ("NMPC on batches of observations", solvers.batches),
     "wild": ("The real-time NMPC on wild observations", wild.wild),

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.ticker import EngFormatter
+
 from experiments.figures import COLOURS
 from trajectories.atomic import write_atomically
 
@@ -28,8 +30,11 @@ def draw(lines: Sequence[dict[str, Any]], file: Path) -> None:
         axes.plot(steps[best], values[best], "o", color=COLOURS[1], label="kept")
         axes.set(xlabel="steps", ylabel=label)
         axes.grid(alpha=0.3)
-        if min(values) > 0.0 and max(values) > 5.0 * min(values):
-            axes.set_yscale("log")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    # The first policies leave the road: where the last ones are is what matters.
+    left.set_ylim(
+        0.0, 1.3 * max(line["validation"]["mean_ale"] for line in lines[len(lines) // 2 :])
+    )
     left.legend()
     figure.suptitle(f"{lines[-1]['seconds']:.0f} s, {lines[-1]['solves']:,} NMPC solves")
     buffer = io.BytesIO()
