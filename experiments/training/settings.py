@@ -17,7 +17,7 @@ PPO = {
     "hidden": [64, 64], "activation": "tanh", "origin": "actuators",
 }  # fmt: skip
 OFF_POLICY = {
-    "learning_rate": 1e-3, "last_learning_rate": 2e-5, "buffer": 300_000, "batch": 512,
+    "learning_rate": 1e-3, "last_learning_rate": 2e-5, "buffer": 300_000, "batch": 256,
     "gradient_steps": 16, "learning_starts": 10_000, "discount": 0.97, "target_rate": 0.01,
     "hidden": [64, 64], "activation": "relu", "origin": "actuators",
 }  # fmt: skip
@@ -37,7 +37,7 @@ HYPERPARAMETERS: dict[str, dict[str, Any]] = {
 
 ENVS = {"ppo": 512, "residual": 256, "sac": 64, "td3": 64, "bc": 256}
 STEPS = {
-    "ppo": 20_000_000, "residual": 3_000_000, "sac": 1_500_000, "td3": 1_500_000, "bc": 1_500_000,
+    "ppo": 20_000_000, "residual": 3_000_000, "sac": 1_000_000, "td3": 1_000_000, "bc": 300_000,
 }  # fmt: skip
 SEGMENTS = {
     "ppo": 1_000_000, "residual": 250_000, "sac": 100_000, "td3": 100_000, "bc": 100_000,
