@@ -23,6 +23,7 @@ REGISTRY: dict[str, str] = {
     "pure-pursuit": "agents.geometric:PurePursuit",
     "lqr": "agents.lqr:LpvLqr",
     "pid": "agents.pid:Pid",
+    "ppo": "agents.learned.agent:Ppo",
 }
 """Name -> "module:Class"; the class takes a `DrivingTask` and its own keyword settings."""
 
