@@ -81,9 +81,10 @@ class _Part:
             alone = self._future.memory(1)
             alone.commands[:] = self._delays.commands[row]
             self._future.look(seen, np.zeros(1, dtype=np.bool_), alone)
-        features: NDArray[np.float32] = self._features(
-            seen, self._origin_of(seen, self._base and self._base.new_memory().memory, None)[0]
-        )[0]
+        # The row's own memory is the next episode's by now.
+        fresh = None if self._base is None else self._base.new_memory().memory
+        origin, _ = self._origin_of(seen, fresh, None)
+        features: NDArray[np.float32] = self._features(seen, origin)[0]
         return features
 
     def act(self, outputs: Array) -> NDArray[np.float32]:
