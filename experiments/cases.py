@@ -24,11 +24,13 @@ from experiments.rollout import Rollout, rollout
 from lpv_track_env import conditions, plants, vehicle
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.naming import choose
+from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import SPEED_MODES
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.compilation import source_digest
 
 VEHICLE_FIELDS = tuple(field.name for field in fields(VehicleParameters))
+REWARD_FIELDS = tuple(field.name for field in fields(RewardWeights))
 ENV_SETTINGS = tuple(
     parameter.name
     for parameter in inspect.signature(PathTrackingEnv).parameters.values()
@@ -100,6 +102,7 @@ class Case:
         self.make_computing()
         for key in self.env_settings:
             choose("environment setting", key, ENV_SETTINGS)
+        self.resolved_env_settings()
         for key in self.vehicle_changes:
             choose("vehicle field", key, VEHICLE_FIELDS)
         plants.make(self.env_settings.get("plant", plants.BICYCLE), self.make_vehicle())
@@ -117,6 +120,15 @@ class Case:
         """Conditions as the environment takes them; JSON's lists are ranges."""
         return self.conditions if isinstance(self.conditions, str) else dict(self.conditions)
 
+    def resolved_env_settings(self) -> dict[str, Any]:
+        """Settings as the environment takes them; a dictionary of reward weights is made one."""
+        settings = dict(self.env_settings)
+        if isinstance(weights := settings.get("reward_weights"), Mapping):
+            for key in weights:
+                choose("reward weight", key, REWARD_FIELDS)
+            settings["reward_weights"] = RewardWeights(**weights)
+        return settings
+
     def make_env(self, **settings: Any) -> gymnasium.Env[Any, Any]:
         """The case's environment; `settings` are added to the case's own."""
         return gymnasium.make(
@@ -127,7 +139,7 @@ class Case:
             fixed_speed=self.fixed_speed,
             conditions=self.plain_conditions,
             control_period=self.control_period,
-            **{**self.env_settings, **settings},
+            **{**self.resolved_env_settings(), **settings},
         )
 
     def make_computing(self) -> ComputingTimes | None:

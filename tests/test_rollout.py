@@ -214,3 +214,14 @@ def test_reset_options_reach_the_environment():
     done = rollout(env, make("stanley", env), options={"lateral_error": 0.4})
     assert done.trace.lateral_error[0] == pytest.approx(0.4)
     assert np.abs(done.trace.lateral_error[-1]) < 0.05
+
+
+def test_a_case_takes_reward_weights_as_plain_values() -> None:
+    spec = {"agent": "stanley", "trajectory": "u-turn"}
+    usual = run_case(spec)
+    weighted = run_case({**spec, "env_settings": {"reward_weights": {"lateral_scale": 0.01}}})
+    assert weighted["metrics"]["ale"] == usual["metrics"]["ale"]
+    assert weighted["metrics"]["reward"] < usual["metrics"]["reward"]
+    assert weighted["id"] != usual["id"]
+    with pytest.raises(ValueError, match="lateral"):
+        Case(**spec, env_settings={"reward_weights": {"laterall": 1.0}}).check()

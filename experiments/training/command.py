@@ -90,7 +90,7 @@ class Display:
         """A segment is done and validated."""
         judged = line["validation"]
         self._console.print(
-            f"{line['steps']:>11,} steps {line['seconds']:7.0f} s   validation: "
+            f"{line['steps']:>11,} steps {line['seconds']:6.0f} s  loss {judged['loss']:7.4f}  "
             f"finished {judged['finished']:4.0%}  ALE {judged['mean_ale']:.4f} m  "
             f"MLE {judged['worst_mle']:.3f} m  steering {judged['mean_steering_variation']:.1f} rad"
             f"{'  best so far' if line['best'] else ''}",

@@ -37,7 +37,7 @@ HYPERPARAMETERS: dict[str, dict[str, Any]] = {
 
 ENVS = {"ppo": 512, "residual": 256, "sac": 64, "td3": 64, "bc": 256}
 STEPS = {
-    "ppo": 20_000_000, "residual": 3_000_000, "sac": 1_000_000, "td3": 1_000_000, "bc": 300_000,
+    "ppo": 20_000_000, "residual": 3_000_000, "sac": 600_000, "td3": 600_000, "bc": 300_000,
 }  # fmt: skip
 SEGMENTS = {
     "ppo": 1_000_000, "residual": 250_000, "sac": 100_000, "td3": 100_000, "bc": 100_000,

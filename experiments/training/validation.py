@@ -1,5 +1,6 @@
 """How good a policy is on paths that it does not train on, by the benchmark's own cases."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,6 @@ import numpy as np
 from experiments.cases import Case, run_case
 from experiments.training.seeds import VALIDATION_PATHS, random_names
 from experiments.training.settings import TrainingSettings
-
-EDGE = 5.0
-"""m, the corridor's edge: what an unfinished drive counts for."""
 
 
 def cases(settings: TrainingSettings, policy: Path) -> list[dict[str, Any]]:
@@ -26,6 +24,7 @@ def cases(settings: TrainingSettings, policy: Path) -> list[dict[str, Any]]:
             env_settings={
                 "preview_steps": settings.preview_steps,
                 "preview_period": settings.preview_period,
+                "reward_weights": asdict(settings.reward_weights()),
             },
         ).as_dict()
         for kind in settings.conditions
@@ -36,8 +35,8 @@ def cases(settings: TrainingSettings, policy: Path) -> list[dict[str, Any]]:
 def validate(settings: TrainingSettings, policy: Path) -> dict[str, float]:
     """Drive the validation cases: share that finished, ALE and MLE (m), steering.
 
-    `loss`, by which the best policy is chosen, is the mean ALE, an unfinished drive counting as if
-    it had been at the corridor's edge.
+    `loss`, by which the best policy is chosen, is what the drives fall short of the reward of
+    perfect tracking, 1 a second: the reward that the training maximises, mean over the drives.
 
     Raises
     ------
@@ -50,8 +49,12 @@ def validate(settings: TrainingSettings, policy: Path) -> dict[str, float]:
             raise ValueError(f"validation on {result['trajectory']}: {result['error']}")
     finished = np.array([result["end"] == "finished" for result in results])
     ale = np.array([result["metrics"]["ale"] for result in results])
+    rewards = [
+        result["metrics"]["reward"] / max(result["metrics"]["duration"], settings.control_period)
+        for result in results
+    ]
     return {
-        "loss": float(np.where(finished, ale, EDGE).mean()),
+        "loss": 1.0 - float(np.mean(rewards)),
         "finished": float(finished.mean()),
         "mean_ale": float(ale.mean()),
         "worst_mle": float(max(result["metrics"]["mle"] for result in results)),
