@@ -280,7 +280,7 @@ def test_the_command_trains_resumes_and_refuses(
     assert command(*words) == 0
     said = capsys.readouterr().out
     assert "512 steps" in said
-    assert "best so far" in said
+    assert "m  best\n" in said
     assert (tmp_path / "out" / "training.png").read_bytes().startswith(b"\x89PNG")
     again = read_policy(tmp_path / "out" / "policy.json").training["command"]
     assert again == (

@@ -90,10 +90,9 @@ class Display:
         """A segment is done and validated."""
         judged = line["validation"]
         self._console.print(
-            f"{line['steps']:>11,} steps {line['seconds']:6.0f} s  loss {judged['loss']:7.4f}  "
-            f"finished {judged['finished']:4.0%}  ALE {judged['mean_ale']:.4f} m  "
-            f"MLE {judged['worst_mle']:.3f} m  steering {judged['mean_steering_variation']:.1f} rad"
-            f"{'  best so far' if line['best'] else ''}",
+            f"{line['steps']:>11,} steps {line['seconds']:5.0f} s  loss {judged['loss']:7.4f}  "
+            f"finished {judged['finished']:4.0%}  ALE {judged['mean_ale']:.4f} m"
+            f"{'  best' if line['best'] else ''}",
             markup=False, highlight=False,
         )  # fmt: skip
 
