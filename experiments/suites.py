@@ -23,7 +23,7 @@ HELD_OUT = tuple(f"random-{seed}" for seed in range(20))
 """Random paths that no training of `lpv-track train` has seen, nor its validation."""
 BESIDE = {"initial_error_range": [0.3, 0.1, 0.5]}
 """Episodes that begin beside the path: in simulation, all that a seed can change."""
-LEARNED = ("ppo", "sac", "bc", "residual")
+LEARNED = ("ppo", "sac", "bc")
 """Shipped policies; they see 1 s ahead, too little to cut the corners of raw waypoints."""
 DEMONSTRATION = "lpv-mpc-frozen"
 """An agent that shows why not to drive so."""

@@ -161,12 +161,3 @@ class Bc(LearnedPolicy):
         self, task: DrivingTask, *, policy: str | Path | Policy = CHECKPOINTS / "bc.json"
     ) -> None:
         super().__init__(task, policy)
-
-
-class Residual(LearnedPolicy):
-    """A correction, learned by PPO, of what `lpv-nmpc` commands; by default the shipped policy."""
-
-    def __init__(
-        self, task: DrivingTask, *, policy: str | Path | Policy = CHECKPOINTS / "residual.json"
-    ) -> None:
-        super().__init__(task, policy)
