@@ -13,8 +13,8 @@ import lpv_track_env  # noqa: F401  registers the environments
 from agents.base import DrivingTask
 from agents.learned.agent import LearnedPolicy
 from agents.learned.learner import LearnerVecEnv
-from agents.learned.policy import Policy
-from agents.learned.scaling import LIMIT, ORIGINS, Scaling, usual_scaling
+from agents.learned.policy import ORIGINS, Policy
+from agents.learned.scaling import LIMIT, Scaling, usual_scaling
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.registration import PATH_TRACKING
 from lpv_track_env.vector_env import PathTrackingVectorEnv
@@ -181,7 +181,7 @@ def test_actions_stay_within_the_action_space() -> None:
     learner.step(np.array([[1.0, 1.0]]))
     a, delta = learner.get_attr("state")[0][0], learner.get_attr("vehicle")[0].max_steering_angle
     assert np.isfinite(a)
-    with pytest.raises(ValueError, match="origin of actions"):
+    with pytest.raises(ValueError, match="unknown origin"):
         usual_scaling(task, "nmpc")
     assert delta > 0.0
 

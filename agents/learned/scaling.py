@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import DrivingTask
+from agents.learned.policy import ORIGINS, Origin
+from lpv_track_env.naming import choose
 from lpv_track_env.observation import PREVIEW_BOUNDS, SCALARS
 from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]
-
-ORIGINS = ("zero", "actuators", "lpv-nmpc")
-"""What an action is an addition to: nothing, the actuators' values, the NMPC's action."""
 
 LIMIT = 10.0
 """Features saturate here: the finer of two scales of one error is for small ones."""
@@ -36,7 +35,8 @@ class Scaling:
     feature_bias: NDArray[np.float32]
     """b, (features,)."""
     feature_limit: float
-    origin: str
+    origin: Origin
+    """What an action is an addition to: nothing, the actuators' values, the NMPC's action."""
     centre: Array
     """(2,) [m/s^2, rad]."""
     half: Array
@@ -53,7 +53,7 @@ class Scaling:
         return np.clip(x, -self.feature_limit, self.feature_limit, out=x)
 
 
-def usual_scaling(task: DrivingTask, origin: str = "actuators") -> Scaling:
+def usual_scaling(task: DrivingTask, origin: Origin = "actuators") -> Scaling:
     """Return the scaling that training uses, from the vehicle's ranges and the layout.
 
     Speeds of the preview are given by their difference from the reference's, the vehicle's by that
@@ -61,6 +61,7 @@ def usual_scaling(task: DrivingTask, origin: str = "actuators") -> Scaling:
     what the actuators have in force, at most what their rates allow in a control period; or, on top
     of the NMPC, a correction of a part of the whole range.
     """
+    choose("origin", origin, ORIGINS)
     car, layout = task.vehicle, task.layout
     sharpest = math.tan(car.max_steering_angle) / car.wheelbase
     accelerations = max(map(abs, car.acceleration_range))
@@ -104,6 +105,4 @@ def _outputs(car: VehicleParameters, period: float, origin: str) -> tuple[Array,
         return np.array([0.5 * (low + high), 0.0]), whole
     if origin == "actuators":
         return np.zeros(2), np.array([car.max_jerk, car.max_steering_rate]) * period
-    if origin == "lpv-nmpc":
-        return np.zeros(2), RESIDUAL_SHARE * whole
-    raise ValueError(f"origin of actions must be one of {', '.join(ORIGINS)}, not {origin!r}")
+    return np.zeros(2), RESIDUAL_SHARE * whole

@@ -24,9 +24,8 @@ from agents.learned.policy import Policy
 from agents.nmpc.rti_agent import RtiNmpc
 from experiments.training.settings import TrainingSettings
 from experiments.training.start import check_start, put_layers
-from experiments.training.trainer import Tick, Trainer
+from experiments.training.trainer import MODULES, Tick, Trainer
 
-ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
 Array = NDArray[Any]
 
 
@@ -43,7 +42,7 @@ class CloningTrainer(Trainer):
         self._linear = [torch.nn.Linear(a, b) for a, b in pairwise(widths)]
         parts: list[torch.nn.Module] = []
         for layer in self._linear:
-            parts += [layer, ACTIVATIONS[self.hyper["activation"]]()]
+            parts += [layer, MODULES[self.hyper["activation"]]()]
         self._device = get_device(settings.device)
         self._net = torch.nn.Sequential(*parts[:-1]).to(self._device)
         if start is not None:

@@ -27,9 +27,8 @@ from agents.learned.learner import LearnerVecEnv
 from agents.learned.policy import Policy
 from experiments.training.settings import TrainingSettings
 from experiments.training.start import check_start, put_layers
-from experiments.training.trainer import Tick, Trainer
+from experiments.training.trainer import MODULES, Tick, Trainer
 
-ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
 KEPT = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 """Arrays of SB3's replay buffer."""
 
@@ -78,7 +77,7 @@ class Sb3Trainer(Trainer):
             "seed": settings.seed,
             "policy_kwargs": {
                 "net_arch": list(hyper["hidden"]),
-                "activation_fn": ACTIVATIONS[hyper["activation"]],
+                "activation_fn": MODULES[hyper["activation"]],
             },
         }
         if settings.algorithm in {"ppo", "residual"}:

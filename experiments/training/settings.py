@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
+from agents.learned.policy import ACTIVATIONS, ORIGINS
 from experiments.suites import SIX
 from lpv_track_env import conditions, vehicle
 from lpv_track_env.naming import choose
@@ -43,6 +44,9 @@ SEGMENTS = {
     "ppo": 1_000_000, "residual": 250_000, "sac": 100_000, "td3": 100_000, "bc": 100_000,
 }  # fmt: skip
 ALGORITHMS = tuple(HYPERPARAMETERS)
+
+BASE = "lpv-nmpc"
+"""Origin of a residual's actions."""
 
 FAST: dict[str, Any] = {
     "conditions": ("simulation",), "envs": 1024, "steps": 5_000_000,
@@ -97,12 +101,7 @@ class TrainingSettings:
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        known = HYPERPARAMETERS[choose("algorithm", self.algorithm, ALGORITHMS)]
-        given = dict(self.hyperparameters)
-        for key, value in given.items():
-            choose(f"hyperparameter of {self.algorithm}", key, tuple(known))
-            _check_kind(key, value, known[key])
-        object.__setattr__(self, "hyperparameters", {**known, **given})
+        object.__setattr__(self, "hyperparameters", _complete(self.algorithm, self.hyperparameters))
         object.__setattr__(self, "conditions", tuple(self.conditions))
         object.__setattr__(self, "trajectories", tuple(self.trajectories))
         for name in ("steps", "envs", "segment", "paths", "validation"):
@@ -171,6 +170,19 @@ def difference(settings: TrainingSettings, stored: Mapping[str, Any]) -> str | N
         if stored.get(key) != value:
             return f"{key} is {value!r}, there {stored.get(key)!r}"
     return None
+
+
+def _complete(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Hyperparameters given, and the defaults of all others."""
+    known = HYPERPARAMETERS[choose("algorithm", algorithm, ALGORITHMS)]
+    for key, value in given.items():
+        choose(f"hyperparameter of {algorithm}", key, tuple(known))
+        _check_kind(key, value, known[key])
+    hyper = {**known, **given}
+    choose("activation", hyper["activation"], ACTIVATIONS)
+    if choose("origin", hyper["origin"], ORIGINS) == BASE != known["origin"]:
+        raise ValueError(f"only residual is trained on top of {BASE}, not {algorithm}")
+    return hyper
 
 
 def _check_kind(key: str, value: Any, usual_value: Any) -> None:

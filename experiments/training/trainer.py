@@ -13,6 +13,9 @@ from agents.learned.policy import Policy
 from experiments.training.seeds import episode_seed
 from experiments.training.settings import TrainingSettings
 
+MODULES: dict[str, type[torch.nn.Module]] = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
+"""Of the activations that a policy may have."""
+
 Tick = Callable[[int, str], None]
 """Told how many steps are done, and what is worth saying."""
 
