@@ -146,6 +146,10 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
         ({"seed": 1000}, "seed"),
         ({"vehicle": "m2"}, "m2-minibus"),
         ({"segment": 0}, "segment"),
+        ({"segment": 255}, "at least 256 steps"),
+        ({"segment": 768, "start": "clone.json"}, "less than steps, 768"),
+        ({"hyperparameters": {"activation": "gelu"}}, "tanh"),
+        ({"hyperparameters": {"origin": "actuator"}}, "actuators"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(changes: dict[str, Any], said: str) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
+from agents.learned.policy import ACTIVATIONS, ORIGINS
 from experiments.suites import SIX
 from lpv_track_env import conditions, vehicle
 from lpv_track_env.naming import choose
@@ -34,6 +35,9 @@ HYPERPARAMETERS: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 """What `--set` may change, by algorithm, with its defaults; see `sb3_trainer` and `cloning`."""
+
+CHOICES = {"activation": ACTIVATIONS, "origin": ORIGINS}
+"""Names that a hyperparameter may be."""
 
 ENVS = {"ppo": 512, "residual": 256, "sac": 64, "td3": 64, "bc": 256}
 STEPS = {
@@ -74,7 +78,8 @@ class TrainingSettings:
     Raises
     ------
     ValueError
-        For an unknown name, a number out of its range, or a path of the benchmark's six.
+        For an unknown name, a number out of its range, segments in which nothing would be learned,
+        or a path of the benchmark's six.
     """
 
     algorithm: str
@@ -102,6 +107,8 @@ class TrainingSettings:
         for key, value in given.items():
             choose(f"hyperparameter of {self.algorithm}", key, tuple(known))
             _check_kind(key, value, known[key])
+            if key in CHOICES:
+                choose(key, value, CHOICES[key])
         object.__setattr__(self, "hyperparameters", {**known, **given})
         object.__setattr__(self, "conditions", tuple(self.conditions))
         object.__setattr__(self, "trajectories", tuple(self.trajectories))
@@ -121,6 +128,23 @@ class TrainingSettings:
                 raise ValueError(f"{name} is for evaluation: train on other paths")
         vehicle.load(self.vehicle)
         self.reward_weights()
+        self._check_segments()
+
+    def _check_segments(self) -> None:
+        """Refuse segments in which nothing is learned."""
+        least = self.envs * self.hyperparameters.get(
+            "rollout", self.hyperparameters.get("round", 1)
+        )
+        if self.segment < min(least, self.steps):
+            raise ValueError(
+                f"segment must be at least {least} steps, what {self.envs} environments drive "
+                f"before they learn of it, not {self.segment}"
+            )
+        if self.start is not None and "rollout" in self.hyperparameters and self.segments < 2:
+            raise ValueError(
+                "from a policy, the first segment fits the value function alone: "
+                f"segment must be less than steps, {self.steps}, not {self.segment}"
+            )
 
     def reward_weights(self) -> RewardWeights:
         """Reward that the training maximises."""
