@@ -47,7 +47,7 @@ class CloningTrainer(Trainer):
         self._device = get_device(settings.device)
         self._net = torch.nn.Sequential(*parts[:-1]).to(self._device)
         if start is not None:
-            check_start(start, settings, env.scaling, squash="clip")
+            check_start(start, settings, env, squash="clip")
             put_layers(start.layers, self._linear)
         self._optimiser = torch.optim.Adam(self._net.parameters(), lr=self.rate_of(0))
         self._expert = RtiNmpc(env.task)

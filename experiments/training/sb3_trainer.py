@@ -62,7 +62,7 @@ class Sb3Trainer(Trainer):
         self.model = self._make()
         self.model.set_logger(logger)
         if start is not None:
-            check_start(start, settings, env.scaling, squash=self._squash)
+            check_start(start, settings, env, squash=self._squash)
             put_layers(start.layers, self._actor_layers())
 
     @property
