@@ -16,7 +16,7 @@ from agents.learned.files import read as read_policy
 from agents.learned.files import write as write_policy
 from experiments import cli
 from experiments.cases import Case, run_case
-from experiments.suites import SIX
+from experiments.suites import HELD_OUT, SIX
 from experiments.training import checkpoint
 from experiments.training.environments import load_paths
 from experiments.training.loop import Listener, make_trainer, train
@@ -126,7 +126,7 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
     validated = {case["trajectory"] for case in cases(tiny("ppo", validation=50), tmp_path)}
     assert not validated & seen
     assert min(int(name.rpartition("-")[2]) for name in validated) >= VALIDATION_PATHS
-    for name in (*SIX, "T2-raw"):
+    for name in (*SIX, "T2-raw", *HELD_OUT):
         with pytest.raises(ValueError, match="is for evaluation"):
             tiny("ppo", trajectories=("circle", name))
 

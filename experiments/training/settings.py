@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 from agents.learned.policy import ACTIVATIONS, ORIGINS
-from experiments.suites import SIX
+from experiments.suites import HELD_OUT, SIX
 from lpv_track_env import conditions, vehicle
 from lpv_track_env.naming import choose
 from lpv_track_env.reward import RewardWeights
@@ -79,7 +79,7 @@ class TrainingSettings:
     ------
     ValueError
         For an unknown name, a number out of its range, segments in which nothing would be learned,
-        or a path of the benchmark's six.
+        or a path that the benchmark drives.
     """
 
     algorithm: str
@@ -124,7 +124,7 @@ class TrainingSettings:
         for given_conditions in self.conditions:
             conditions.load(given_conditions)
         for name in self.trajectories:
-            if name.removesuffix("-raw") in SIX:
+            if name.removesuffix("-raw") in (*SIX, *HELD_OUT):
                 raise ValueError(f"{name} is for evaluation: train on other paths")
         vehicle.load(self.vehicle)
         self.reward_weights()
