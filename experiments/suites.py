@@ -151,7 +151,17 @@ def _several(seeds: Sequence[int]) -> Sequence[int]:
 
 
 def _far_seeing(agent_names: Iterable[str]) -> list[str]:
-    return [name for name in agent_names if name not in LEARNED]
+    return [name for name in agent_names if name not in LEARNED and not _near_sighted(name)]
+
+
+def _near_sighted(name: str) -> bool:
+    """Whether an agent is a policy file that was made for another preview than `RAW_PREVIEW`."""
+    if not name.endswith(".json"):
+        return False
+    from agents.learned.files import read
+
+    layout = read(name).layout
+    return {key: getattr(layout, key) for key in RAW_PREVIEW} != RAW_PREVIEW
 
 
 def _by_speed(agent_names: Sequence[str]) -> tuple[list[str], list[str]]:
