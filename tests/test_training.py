@@ -139,6 +139,7 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
         ({"hyperparameters": {"hidden": []}}, "must be like"),
         ({"hyperparameters": {"discount": float("nan")}}, "must be like"),
         ({"reward": {"laterall": 1.0}}, "lateral"),
+        ({"reward": {"lateral": "high"}}, "must be a number"),
         ({"conditions": ("realtme",)}, "realtime"),
         ({"conditions": ()}, "at least one"),
         ({"envs": 1}, "as many environments"),

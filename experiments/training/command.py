@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import shlex
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -161,7 +162,7 @@ def command_line(settings: TrainingSettings, options: argparse.Namespace) -> str
             many = value if isinstance(value, list) else [value]
             option = "--from" if name == "start" else "--" + name.replace("_", "-")
             words += [option, *map(str, many)]
-    return " ".join([*words, *(["--fast"] if options.fast else [])])
+    return shlex.join([*words, *(["--fast"] if options.fast else [])])
 
 
 def _steps_in(settings: TrainingSettings, seconds: float, console: Console) -> int:

@@ -148,8 +148,10 @@ class TrainingSettings:
 
     def reward_weights(self) -> RewardWeights:
         """Reward that the training maximises."""
-        for key in self.reward:
+        for key, value in self.reward.items():
             choose("reward weight", key, tuple(item.name for item in fields(RewardWeights)))
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ValueError(f"reward weight {key} must be a number, not {value!r}")
         return RewardWeights(**self.reward)
 
     @property
