@@ -2,6 +2,7 @@
 
 import io
 import json
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -335,3 +336,27 @@ def test_the_best_policy_on_validation_is_kept(tmp_path: Path) -> None:
     # The weights are those that were validated then.
     assert validate(tiny("bc"), tmp_path / "policy.json") == policy.training["validation"]
     assert not list(tmp_path.glob("candidate*"))
+
+
+def test_a_training_outlives_the_file_that_it_started_from(tmp_path: Path) -> None:
+    start = tmp_path / "start" / "policy.json"
+    train(tiny("bc", steps=256, segment=256), start.parent, SILENT, command="first")
+
+    def take_away(line: dict[str, Any]) -> None:
+        start.unlink(missing_ok=True)
+
+    train(tiny("ppo", start=str(start)), tmp_path / "out",
+          Listener(silent, silent, take_away), command="second")  # fmt: skip
+    training = read_policy(tmp_path / "out" / "policy.json").training
+    assert (training["start"], training["command"]) == ("first", "second")
+    assert training["steps"] == 768 + 256
+
+
+def test_what_fails_leaves_no_thread_behind(tmp_path: Path) -> None:
+    def full(line: dict[str, Any]) -> None:
+        raise OSError("no space left on device")
+
+    before = threading.active_count()
+    with pytest.raises(OSError, match="no space"):
+        train(tiny("ppo"), tmp_path, Listener(silent, silent, full), command="test")
+    assert threading.active_count() == before

@@ -1,8 +1,9 @@
 """A training from its beginning, or its last checkpoint, to its end."""
 
+import contextlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -109,42 +110,46 @@ def train(
         raise ValueError(f"{folder} holds a training with other settings: {differs}")
     kept = checkpoint.read(folder)
     paths = load_paths(settings, listener.loading)
-    logger = configure(str(folder / "tensorboard"), ["tensorboard"])
-    trainer = make_trainer(settings, paths, logger)
-    _write_json(folder / SETTINGS, settings.as_dict())
-    lines: list[dict[str, Any]] = []
-    if kept is not None:
-        trainer.restore(kept["trainer"])
-        lines = kept["lines"]
-    _write_lines(folder, lines)
-    before, learned = (lines[-1][key] if lines else 0.0 for key in ("seconds", "learning_seconds"))
-    began = time.perf_counter()
-    with Interrupts() as interrupts:
-        for number in range(len(lines), settings.segments):
-            started = time.perf_counter()
-            figures = trainer.segment(number, listener.step)
-            learned += time.perf_counter() - started
-            interrupts.check()
-            line = _judge(trainer, folder, lines, {
-                "segment": number,
-                "steps": trainer.steps,
-                "solves": trainer.solves,
-                "seconds": before + time.perf_counter() - began,
-                "learning_seconds": learned,
-                **figures,
-            }, command)  # fmt: skip
-            interrupts.check()
-            for name, value in line["validation"].items():
-                logger.record(f"validation/{name}", value)
-            logger.dump(trainer.steps)
-            lines.append(line)
-            checkpoint.write(folder, {"trainer": trainer.state(), "lines": lines})
-            _write_lines(folder, lines)
-            listener.segment(line)
-            if seconds_at_most is not None and line["seconds"] > seconds_at_most:
-                break
-    logger.close()
-    trainer.env.close()
+    start = read_policy(Path(settings.start)).training if settings.start else {}
+    with contextlib.ExitStack() as closing:
+        logger = configure(str(folder / "tensorboard"), ["tensorboard"])
+        closing.callback(logger.close)
+        trainer = make_trainer(settings, paths, logger)
+        closing.callback(trainer.env.close)
+        _write_json(folder / SETTINGS, settings.as_dict())
+        lines: list[dict[str, Any]] = []
+        if kept is not None:
+            trainer.restore(kept["trainer"])
+            lines = kept["lines"]
+        _write_lines(folder, lines)
+        before, learned = (
+            lines[-1][key] if lines else 0.0 for key in ("seconds", "learning_seconds")
+        )
+        began = time.perf_counter()
+        with Interrupts() as interrupts:
+            for number in range(len(lines), settings.segments):
+                started = time.perf_counter()
+                figures = trainer.segment(number, listener.step)
+                learned += time.perf_counter() - started
+                interrupts.check()
+                line = _judge(trainer, folder, lines, {
+                    "segment": number,
+                    "steps": trainer.steps,
+                    "solves": trainer.solves,
+                    "seconds": before + time.perf_counter() - began,
+                    "learning_seconds": learned,
+                    **figures,
+                }, command, start)  # fmt: skip
+                interrupts.check()
+                for name, value in line["validation"].items():
+                    logger.record(f"validation/{name}", value)
+                logger.dump(trainer.steps)
+                lines.append(line)
+                checkpoint.write(folder, {"trainer": trainer.state(), "lines": lines})
+                _write_lines(folder, lines)
+                listener.segment(line)
+                if seconds_at_most is not None and line["seconds"] > seconds_at_most:
+                    break
     return lines
 
 
@@ -154,11 +159,12 @@ def _judge(
     lines: list[dict[str, Any]],
     line: dict[str, Any],
     command: str,
+    start: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Validate the policy as it is; it becomes the folder's if it is the best so far.
 
     Whether it does or not, the folder's policy tells what all of the training has cost by now,
-    with that of the policy it started from.
+    with that of the policy it started from (`start`, its `training`).
     """
     settings, candidate, kept = trainer.settings, folder / "candidate.json", folder / POLICY
     write_policy(trainer.policy({}), candidate)
@@ -172,7 +178,6 @@ def _judge(
     if not line["best"]:
         before = read_policy(kept).training
         found = {key: before[key] for key in found}
-    start = read_policy(Path(settings.start)).training if settings.start else {}
     training = {
         "command": command,
         "settings": settings.as_dict(),

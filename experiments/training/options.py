@@ -33,7 +33,9 @@ def add_training_options(train: argparse.ArgumentParser) -> None:
         help="fields to change in each of them, e.g. friction=[0.4,1.0]",
     )  # fmt: skip
     train.add_argument(
-        "--trajectories", nargs="+", metavar="NAME",
+        "--trajectories",
+        nargs="+",
+        metavar="NAME",
         help="own paths in place of random ones; not those of the suites paper and learned",
     )
     train.add_argument("--paths", type=int, metavar="N", help="random paths (default 48)")

@@ -107,8 +107,6 @@ class TrainingSettings:
         for key, value in given.items():
             choose(f"hyperparameter of {self.algorithm}", key, tuple(known))
             _check_kind(key, value, known[key])
-            if key in CHOICES:
-                choose(key, value, CHOICES[key])
         object.__setattr__(self, "hyperparameters", {**known, **given})
         object.__setattr__(self, "conditions", tuple(self.conditions))
         object.__setattr__(self, "trajectories", tuple(self.trajectories))
@@ -151,7 +149,7 @@ class TrainingSettings:
         for key, value in self.reward.items():
             choose("reward weight", key, tuple(item.name for item in fields(RewardWeights)))
             if isinstance(value, bool) or not isinstance(value, int | float):
-                raise ValueError(f"reward weight {key} must be a number, not {value!r}")
+                raise ValueError(f"reward weight {key} must be a number, not {value!r}")  # noqa: TRY004
         return RewardWeights(**self.reward)
 
     @property
@@ -215,3 +213,5 @@ def _check_kind(key: str, value: Any, usual_value: Any) -> None:
         good = type(value) in {int, float} and math.isfinite(value) and value >= 0.0
     if not good:
         raise ValueError(f"hyperparameter {key} must be like {usual_value!r}, not {value!r}")
+    if key in CHOICES:
+        choose(key, value, CHOICES[key])
