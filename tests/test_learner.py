@@ -176,14 +176,25 @@ def test_the_usual_scaling_says_what_its_docstring_does(
 def test_actions_stay_within_the_action_space() -> None:
     task = DrivingTask.of(gymnasium.make(PATH_TRACKING))
     wide = Scaling(**{**vars(usual_scaling(task, "zero")), "half": np.array([100.0, 10.0])})
-    learner = LearnerVecEnv(vec_env(1), wide)
+    below = vec_env(4)
+    sent: list[Any] = []
+    send = below.step_async
+
+    def noted(actions: Any) -> None:
+        sent.append(np.array(actions))
+        send(actions)
+
+    below.step_async = noted
+    learner = LearnerVecEnv(below, wide)
     learner.reset()
-    learner.step(np.array([[1.0, 1.0]]))
-    a, delta = learner.get_attr("state")[0][0], learner.get_attr("vehicle")[0].max_steering_angle
-    assert np.isfinite(a)
+    # Beyond [-1, 1], as a policy's noise may be.
+    learner.step(np.array([[1.0, 1.0], [-1.0, -1.0], [9.0, -9.0], [0.0, 0.0]]))
+    low, high = task.action_bounds
+    expected = [high, low, [high[0], low[1]], wide.centre.astype(np.float32)]
+    np.testing.assert_array_equal(sent[0], expected)
+    assert all(below.action_space.contains(action) for action in sent[0])
     with pytest.raises(ValueError, match="unknown origin"):
         usual_scaling(task, "nmpc")
-    assert delta > 0.0
 
 
 def test_the_agent_is_told_of_by_name() -> None:

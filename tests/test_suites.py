@@ -1,8 +1,10 @@
 """Suites: what they drive, and that all of it can be driven."""
 
 from collections import Counter
+from pathlib import Path
 
 import pytest
+from learned_policies import random_policy, written
 
 import agents
 from experiments.cases import Case
@@ -17,6 +19,7 @@ from experiments.suites import (
     default_agents,
 )
 from experiments.training.seeds import TRAINING_PATHS, VALIDATION_PATHS
+from lpv_track_env.observation import ObservationLayout
 
 
 @pytest.mark.parametrize("suite", SUITES)
@@ -86,6 +89,16 @@ def test_learned_policies_are_compared_on_paths_that_nobody_trained_on() -> None
         **{(name, "None"): alone for name in fast},
         **{(name, "realtime"): (6 + len(HELD_OUT)) * LEAST_SEEDS for name in fast},
     }
-    numbers = [int(name.removeprefix("random-")) for name in HELD_OUT]
+    numbers = [int(name.rpartition("-")[2]) for name in HELD_OUT]
     assert len(numbers) == 20
     assert max(numbers) < TRAINING_PATHS < VALIDATION_PATHS
+
+
+@pytest.mark.parametrize(("steps", "period", "raw"), [(20, 0.05, 0), (30, 0.05, 0), (30, 0.1, 6)])
+def test_a_policy_file_drives_raw_waypoints_if_it_was_made_for_their_preview(
+    steps: int, period: float, raw: int, tmp_path: Path
+) -> None:
+    file = written(tmp_path, random_policy(layout=ObservationLayout(steps, period)))
+    specs = SUITES["paper"]([str(file), "stanley"], [0])
+    drives = Counter(spec["agent"] for spec in specs if spec["trajectory"] in RAW)
+    assert drives == Counter({str(file): raw, "stanley": 6})

@@ -2,6 +2,7 @@
 
 import io
 import json
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -13,34 +14,34 @@ import torch
 from stable_baselines3.common.logger import Logger
 
 from agents.learned.files import read as read_policy
-from agents.learned.files import write as write_policy
 from experiments import cli
-from experiments.cases import Case, run_case
-from experiments.suites import SIX
+from experiments.cases import run_case
+from experiments.suites import HELD_OUT, SIX
 from experiments.training import checkpoint
 from experiments.training.environments import load_paths
+from experiments.training.hyperparameters import HYPERPARAMETERS
 from experiments.training.loop import Listener, make_trainer, train
 from experiments.training.seeds import (
     TRAINING_EPISODES,
     TRAINING_PATHS,
+    VALIDATION_EPISODES,
     VALIDATION_PATHS,
     episode_seed,
     path_names,
 )
 from experiments.training.settings import (
     ALGORITHMS,
-    HYPERPARAMETERS,
     REWARD,
     TrainingSettings,
     difference,
     usual,
 )
-from experiments.training.validation import cases
+from experiments.training.validation import cases, validate
 
 TINY: dict[str, dict[str, Any]] = {
     "ppo": {"steps": 768, "hyperparameters": {"rollout": 16, "batch": 64}},
     "residual": {"steps": 768, "hyperparameters": {"rollout": 16, "batch": 64}},
-    "sac": {"steps": 384, "hyperparameters": {"learning_starts": 64, "gradient_steps": 2,
+    "sac": {"steps": 384, "hyperparameters": {"learning_starts": 200, "gradient_steps": 2,
                                               "batch": 32, "buffer": 256}},
     "td3": {"steps": 384, "hyperparameters": {"learning_starts": 64, "gradient_steps": 3,
                                               "batch": 32, "buffer": 256}},
@@ -126,7 +127,9 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
     validated = {case["trajectory"] for case in cases(tiny("ppo", validation=50), tmp_path)}
     assert not validated & seen
     assert min(int(name.rpartition("-")[2]) for name in validated) >= VALIDATION_PATHS
-    for name in (*SIX, "T2-raw"):
+    drawn = {case["seed"] for case in cases(tiny("ppo", validation=50), tmp_path)}
+    assert VALIDATION_EPISODES <= min(drawn) <= max(drawn) < TRAINING_EPISODES
+    for name in (*SIX, "T2-raw", *HELD_OUT):
         with pytest.raises(ValueError, match="is for evaluation"):
             tiny("ppo", trajectories=("circle", name))
 
@@ -143,12 +146,20 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
         ({"hyperparameters": {"origin": "actuator"}}, "actuators"),
         ({"hyperparameters": {"origin": "lpv-nmpc"}}, "only residual"),
         ({"reward": {"laterall": 1.0}}, "lateral"),
+        ({"reward": {"lateral": "high"}}, "must be a number"),
         ({"conditions": ("realtme",)}, "realtime"),
         ({"conditions": ()}, "at least one"),
         ({"envs": 1}, "as many environments"),
         ({"seed": 1000}, "seed"),
         ({"vehicle": "m2"}, "m2-minibus"),
         ({"segment": 0}, "segment"),
+        ({"segment": 255}, "at least 256 steps"),
+        ({"segment": 768, "start": "clone.json"}, "less than steps, 768"),
+        ({"hyperparameters": {"activation": "gelu"}}, "tanh"),
+        ({"hyperparameters": {"batch": 1}}, "batch must be in"),
+        ({"hyperparameters": {"discount": 1.5}}, "discount must be in"),
+        ({"hyperparameters": {"deviation": 0.0}}, "deviation must be in"),
+        ({"paths": 1001}, "at most 1000"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(changes: dict[str, Any], said: str) -> None:
@@ -218,6 +229,8 @@ def test_a_training_starts_from_a_policy_and_does_not_lose_it_at_once(tmp_path: 
         ({"hyperparameters": other_layers}, "hidden layers"),
         ({"hyperparameters": zero}, "origin of actions"),
         ({"vehicle": "course-car"}, "features or range"),
+        ({"preview_period": 0.1}, "preview period"),
+        ({"preview_steps": 30}, "preview steps"),
     ):
         other = tiny("ppo", start=str(start), **changes)
         with pytest.raises(ValueError, match=said):
@@ -329,8 +342,30 @@ def test_the_best_policy_on_validation_is_kept(tmp_path: Path) -> None:
     assert policy.training["kept_at"] == kept["lines"][best]["steps"]
     assert policy.training["steps"] == kept["lines"][-1]["steps"]
     assert [line["best"] for line in kept["lines"]][best]
-    case = cases(tiny("bc"), tmp_path / "policy.json")[0]
-    assert run_case(case)["metrics"]["ale"] >= 0.0
+    # The weights are those that were validated then.
+    assert validate(tiny("bc"), tmp_path / "policy.json") == policy.training["validation"]
     assert not list(tmp_path.glob("candidate*"))
-    write_policy(policy, tmp_path / "copy.json")
-    assert Case(agent=str(tmp_path / "copy.json"), trajectory="circle").id
+
+
+def test_a_training_outlives_the_file_that_it_started_from(tmp_path: Path) -> None:
+    start = tmp_path / "start" / "policy.json"
+    train(tiny("bc", steps=256, segment=256), start.parent, SILENT, command="first")
+
+    def take_away(line: dict[str, Any]) -> None:
+        start.unlink(missing_ok=True)
+
+    train(tiny("ppo", start=str(start)), tmp_path / "out",
+          Listener(silent, silent, take_away), command="second")  # fmt: skip
+    training = read_policy(tmp_path / "out" / "policy.json").training
+    assert (training["start"], training["command"]) == ("first", "second")
+    assert training["steps"] == 768 + 256
+
+
+def test_what_fails_leaves_no_thread_behind(tmp_path: Path) -> None:
+    def full(line: dict[str, Any]) -> None:
+        raise OSError("no space left on device")
+
+    before = threading.active_count()
+    with pytest.raises(OSError, match="no space"):
+        train(tiny("ppo"), tmp_path, Listener(silent, silent, full), command="test")
+    assert threading.active_count() == before

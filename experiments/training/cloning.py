@@ -43,20 +43,15 @@ class CloningTrainer(Trainer):
         parts: list[torch.nn.Module] = []
         for layer in self._linear:
             parts += [layer, MODULES[self.hyper["activation"]]()]
-        self._device = get_device(settings.device)
-        self._net = torch.nn.Sequential(*parts[:-1]).to(self._device)
+        self.device = get_device(settings.device)
+        self._net = torch.nn.Sequential(*parts[:-1]).to(self.device)
         if start is not None:
-            check_start(start, settings, env.scaling, squash="clip")
+            check_start(start, settings, env, squash="clip")
             put_layers(start.layers, self._linear)
-        self._optimiser = torch.optim.Adam(self._net.parameters(), lr=self.rate_of(0))
         self._expert = RtiNmpc(env.task)
         self._asked = np.zeros((0, env.scaling.features), dtype=np.float32)
         self._said = np.zeros((0, 2), dtype=np.float32)
-
-    def rate_of(self, steps: int) -> float:
-        """Learning rate after so many steps."""
-        first, last = self.hyper["learning_rate"], self.hyper["last_learning_rate"]
-        return float(first + min(steps / self.settings.steps, 1.0) * (last - first))
+        self._optimiser = torch.optim.Adam(self._net.parameters(), lr=self.rate())
 
     @property
     def steps(self) -> int:
@@ -105,7 +100,7 @@ class CloningTrainer(Trainer):
 
     def _outputs(self, features: Array) -> Array:
         with torch.no_grad():
-            outputs: Array = self._net(torch.from_numpy(features).to(self._device)).cpu().numpy()
+            outputs: Array = self._net(torch.from_numpy(features).to(self.device)).cpu().numpy()
         return outputs
 
     def _fit(self) -> float:
@@ -113,11 +108,11 @@ class CloningTrainer(Trainer):
         for group in self._optimiser.param_groups:
             group["lr"] = self.rate()
         inputs, targets = (
-            torch.from_numpy(values).to(self._device) for values in (self._asked, self._said)
+            torch.from_numpy(values).to(self.device) for values in (self._asked, self._said)
         )
         updates, losses = self.hyper["updates"], []
         for _ in range(updates):
-            rows = torch.randint(len(inputs), (self.hyper["batch"],), device=self._device)
+            rows = torch.randint(len(inputs), (self.hyper["batch"],), device=self.device)
             loss = torch.nn.functional.mse_loss(self._net(inputs[rows]), targets[rows])
             self._optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]

@@ -2,7 +2,7 @@
 
 import argparse
 import math
-import time
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from experiments.benchmark import parse_settings, progress_bar
+from experiments.training.budget import fitted
 from experiments.training.settings import FAST, TrainingSettings, usual, with_steps
 
 
@@ -109,24 +110,23 @@ def run_training(options: argparse.Namespace, console: Console) -> int:
         train,
     )
 
-    folder: Path = options.out
-    if has_training(folder) and not options.resume:
+    folder: Path = options.out or Path("results/train") / options.algorithm
+    going_on = has_training(folder)
+    if going_on and not options.resume:
         raise ValueError(f"{folder} holds a training already: say --resume, or give another --out")
     settings = settings_of(options)
-    display = Display(console, settings)
-    listener = Listener(display.loading, display.step, display.segment)
     at_most = None
     if options.hours is not None:
         if not options.hours > 0.0:
             raise ValueError(f"--hours must be positive, not {options.hours}")
         at_most = 3600.0 * options.hours
-        if options.resume and has_training(folder):
+        if going_on and options.steps is None:
             # What the first run made of its hours holds.
             settings = with_steps(settings, int(stored_settings(folder)["steps"]))
         elif options.steps is None:
-            settings = with_steps(settings, _steps_in(settings, at_most, console))
-            display = Display(console, settings)
-            listener = Listener(display.loading, display.step, display.segment)
+            settings, at_most = fitted(settings, at_most, console)
+    display = Display(console, settings)
+    listener = Listener(display.loading, display.step, display.segment)
     try:
         with display.progress:
             lines = train(
@@ -153,37 +153,14 @@ def command_line(settings: TrainingSettings, options: argparse.Namespace) -> str
     words += ["--seed", str(settings.seed)]
     for name in (
         "vehicle", "conditions", "conditions_set", "trajectories", "paths", "envs", "segment",
-        "start", "control_period", "preview_steps", "preview_period", "set", "reward",
+        "start", "control_period", "preview_steps", "preview_period", "set", "reward", "device",
     ):  # fmt: skip
         value = getattr(options, name)
         if value:
             many = value if isinstance(value, list) else [value]
             option = "--from" if name == "start" else "--" + name.replace("_", "-")
             words += [option, *map(str, many)]
-    return " ".join([*words, *(["--fast"] if options.fast else [])])
-
-
-def _steps_in(settings: TrainingSettings, seconds: float, console: Console) -> int:
-    """Steps that some time allows, from a trial of the same training that is thrown away."""
-    import tempfile
-
-    from experiments.training.loop import Listener, train
-
-    def silent(*_: Any) -> None:
-        return
-
-    console.print("measuring how many steps the time allows ...")
-    with tempfile.TemporaryDirectory() as scratch:
-        # The first segment compiles; a short one shows how fast it then is.
-        short = min(settings.segment, 200_000)
-        trial = replace(settings, steps=3 * short, segment=short)
-        began = time.perf_counter()
-        lines = train(trial, Path(scratch), Listener(silent, silent, silent), command="")
-        spent = time.perf_counter() - began
-    rate = (lines[-1]["steps"] - lines[0]["steps"]) / (lines[-1]["seconds"] - lines[0]["seconds"])
-    steps = int(max(seconds - spent, 1.0) * rate)
-    console.print(f"{rate:,.0f} steps a second with validation: {steps:,} steps", highlight=False)
-    return max(steps, 1)
+    return shlex.join([*words, *(["--fast"] if options.fast else [])])
 
 
 def _need_learning() -> None:

@@ -1,8 +1,9 @@
 """A training from its beginning, or its last checkpoint, to its end."""
 
+import contextlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,13 @@ from experiments.results import hardware, revision, versions
 from experiments.training import checkpoint
 from experiments.training.cloning import CloningTrainer
 from experiments.training.environments import load_paths, make_learner_env
+from experiments.training.lock import alone_in
 from experiments.training.sb3_trainer import Sb3Trainer
 from experiments.training.seeds import path_names
 from experiments.training.settings import TrainingSettings, difference
 from experiments.training.trainer import Trainer
 from experiments.training.validation import validate
+from lpv_track_env import vehicle
 from trajectories.atomic import write_atomically
 
 POLICY, PROGRESS, SETTINGS = "policy.json", "progress.jsonl", "settings.json"
@@ -105,46 +108,61 @@ def train(
         On Ctrl-C; what the last checkpoint has is kept.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    with alone_in(folder):
+        return _train(settings, folder, listener, command, seconds_at_most)
+
+
+def _train(
+    settings: TrainingSettings,
+    folder: Path,
+    listener: Listener,
+    command: str,
+    seconds_at_most: float | None,
+) -> list[dict[str, Any]]:
     if has_training(folder) and (differs := difference(settings, stored_settings(folder))):
         raise ValueError(f"{folder} holds a training with other settings: {differs}")
     kept = checkpoint.read(folder)
     paths = load_paths(settings, listener.loading)
-    logger = configure(str(folder / "tensorboard"), ["tensorboard"])
-    trainer = make_trainer(settings, paths, logger)
-    _write_json(folder / SETTINGS, settings.as_dict())
-    lines: list[dict[str, Any]] = []
-    if kept is not None:
-        trainer.restore(kept["trainer"])
-        lines = kept["lines"]
-    _write_lines(folder, lines)
-    before, learned = (lines[-1][key] if lines else 0.0 for key in ("seconds", "learning_seconds"))
-    began = time.perf_counter()
-    with Interrupts() as interrupts:
-        for number in range(len(lines), settings.segments):
-            started = time.perf_counter()
-            figures = trainer.segment(number, listener.step)
-            learned += time.perf_counter() - started
-            interrupts.check()
-            line = _judge(trainer, folder, lines, {
-                "segment": number,
-                "steps": trainer.steps,
-                "solves": trainer.solves,
-                "seconds": before + time.perf_counter() - began,
-                "learning_seconds": learned,
-                **figures,
-            }, command)  # fmt: skip
-            interrupts.check()
-            for name, value in line["validation"].items():
-                logger.record(f"validation/{name}", value)
-            logger.dump(trainer.steps)
-            lines.append(line)
-            checkpoint.write(folder, {"trainer": trainer.state(), "lines": lines})
-            _write_lines(folder, lines)
-            listener.segment(line)
-            if seconds_at_most is not None and line["seconds"] > seconds_at_most:
-                break
-    logger.close()
-    trainer.env.close()
+    start = read_policy(Path(settings.start)).training if settings.start else {}
+    with contextlib.ExitStack() as closing:
+        logger = configure(str(folder / "tensorboard"), ["tensorboard"])
+        closing.callback(logger.close)
+        trainer = make_trainer(settings, paths, logger)
+        closing.callback(trainer.env.close)
+        _write_json(folder / SETTINGS, settings.as_dict())
+        lines: list[dict[str, Any]] = []
+        if kept is not None:
+            trainer.restore(kept["trainer"])
+            lines = kept["lines"]
+        _write_lines(folder, lines)
+        before, learned = (
+            lines[-1][key] if lines else 0.0 for key in ("seconds", "learning_seconds")
+        )
+        began = time.perf_counter()
+        with Interrupts() as interrupts:
+            for number in range(len(lines), settings.segments):
+                started = time.perf_counter()
+                figures = trainer.segment(number, listener.step)
+                learned += time.perf_counter() - started
+                interrupts.check()
+                line = _judge(trainer, folder, lines, {
+                    "segment": number,
+                    "steps": trainer.steps,
+                    "solves": trainer.solves,
+                    "seconds": before + time.perf_counter() - began,
+                    "learning_seconds": learned,
+                    **figures,
+                }, command, start)  # fmt: skip
+                interrupts.check()
+                for name, value in line["validation"].items():
+                    logger.record(f"validation/{name}", value)
+                logger.dump(trainer.steps)
+                lines.append(line)
+                checkpoint.write(folder, {"trainer": trainer.state(), "lines": lines})
+                _write_lines(folder, lines)
+                listener.segment(line)
+                if seconds_at_most is not None and line["seconds"] > seconds_at_most:
+                    break
     return lines
 
 
@@ -154,17 +172,20 @@ def _judge(
     lines: list[dict[str, Any]],
     line: dict[str, Any],
     command: str,
+    start: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Validate the policy as it is; it becomes the folder's if it is the best so far.
 
     Whether it does or not, the folder's policy tells what all of the training has cost by now,
-    with that of the policy it started from.
+    with that of the policy it started from (`start`, its `training`).
     """
     settings, candidate, kept = trainer.settings, folder / "candidate.json", folder / POLICY
-    write_policy(trainer.policy({}), candidate)
-    judged = validate(settings, candidate)
-    for file in (candidate, candidate.with_suffix(".safetensors")):
-        file.unlink()
+    try:
+        write_policy(trainer.policy({}), candidate)
+        judged = validate(settings, candidate)
+    finally:
+        for file in (candidate, candidate.with_suffix(".safetensors")):
+            file.unlink(missing_ok=True)
     best = min((earlier["validation"]["loss"] for earlier in lines), default=float("inf"))
     line = {**line, "validation": judged, "best": judged["loss"] < best}
     names = path_names(settings)
@@ -172,10 +193,11 @@ def _judge(
     if not line["best"]:
         before = read_policy(kept).training
         found = {key: before[key] for key in found}
-    start = read_policy(Path(settings.start)).training if settings.start else {}
     training = {
         "command": command,
         "settings": settings.as_dict(),
+        "vehicle": vehicle.load(settings.vehicle).name,
+        "device": str(trainer.device),
         "paths": [names[0], names[-1]],
         "steps": line["steps"] + start.get("steps", 0),
         "solves": line["solves"] + start.get("solves", 0),

@@ -12,7 +12,7 @@ def add_training_options(train: argparse.ArgumentParser) -> None:
         "algorithm", choices=ALGORITHMS,
         help="ppo, sac, td3; bc: cloning of lpv-nmpc with DAgger; residual: ppo on top of lpv-nmpc",
     )  # fmt: skip
-    train.add_argument("--out", type=Path, required=True, metavar="DIR")
+    train.add_argument("--out", type=Path, metavar="DIR", help="default: results/train/ALGORITHM")
     train.add_argument("--seed", type=int, default=0, help="0 to 999 (default 0)")
     train.add_argument(
         "--steps", type=float, metavar="N", help="budget in environment steps, e.g. 2e7"
@@ -33,7 +33,10 @@ def add_training_options(train: argparse.ArgumentParser) -> None:
         help="fields to change in each of them, e.g. friction=[0.4,1.0]",
     )  # fmt: skip
     train.add_argument(
-        "--trajectories", nargs="+", metavar="NAME", help="own paths in place of random ones"
+        "--trajectories",
+        nargs="+",
+        metavar="NAME",
+        help="own paths in place of random ones; not those of the suites paper and learned",
     )
     train.add_argument("--paths", type=int, metavar="N", help="random paths (default 48)")
     train.add_argument("--envs", type=int, metavar="N", help="environments side by side")

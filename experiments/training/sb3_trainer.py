@@ -59,9 +59,10 @@ class Sb3Trainer(Trainer):
         self._solves = 0
         self._started = start is not None
         self.model = self._make()
+        self.device = self.model.device
         self.model.set_logger(logger)
         if start is not None:
-            check_start(start, settings, env.scaling, squash=self._squash)
+            check_start(start, settings, env, squash=self._squash)
             put_layers(start.layers, self._actor_layers())
 
     @property
@@ -110,6 +111,8 @@ class Sb3Trainer(Trainer):
     def segment(self, number: int, tick: Tick) -> dict[str, float]:
         """Learn to the end of a segment."""
         self.begin_segment(number)
+        if self.model.ep_info_buffer is not None:
+            self.model.ep_info_buffer.clear()
         # A policy to start from would be lost to a value function that knows nothing yet.
         frozen = self._actor_parameters() if self._started and number == 0 else []
         for parameter in frozen:

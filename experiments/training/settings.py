@@ -1,40 +1,18 @@
 """Everything that determines a training, and the defaults of each algorithm."""
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any
 
-from agents.learned.policy import ACTIVATIONS, ORIGINS
-from experiments.suites import SIX
+from experiments.suites import HELD_OUT, SIX
+from experiments.training.hyperparameters import ALGORITHMS, complete
 from lpv_track_env import conditions, vehicle
 from lpv_track_env.naming import choose
 from lpv_track_env.reward import RewardWeights
-
-PPO = {
-    "learning_rate": 1e-3, "last_learning_rate": 2e-5, "rollout": 32, "batch": 4096, "epochs": 4,
-    "discount": 0.97, "gae_lambda": 0.9, "clip_range": 0.2, "deviation": math.exp(-1.0),
-    "hidden": [64, 64], "activation": "tanh", "origin": "actuators",
-}  # fmt: skip
-OFF_POLICY = {
-    "learning_rate": 1e-3, "last_learning_rate": 2e-5, "buffer": 300_000, "batch": 256,
-    "gradient_steps": 16, "learning_starts": 10_000, "discount": 0.97, "target_rate": 0.01,
-    "hidden": [64, 64], "activation": "relu", "origin": "actuators",
-}  # fmt: skip
-
-HYPERPARAMETERS: dict[str, dict[str, Any]] = {
-    "ppo": PPO,
-    "residual": {**PPO, "deviation": math.exp(-2.0), "origin": "lpv-nmpc"},
-    "sac": OFF_POLICY,
-    "td3": {**OFF_POLICY, "noise": 0.2},
-    "bc": {
-        "learning_rate": 2e-3, "last_learning_rate": 1e-5, "round": 100, "batch": 4096,
-        "updates": 600, "expert_share": 0.25, "noise": 0.3,
-        "hidden": [64, 64], "activation": "tanh", "origin": "actuators",
-    },
-}  # fmt: skip
-"""What `--set` may change, by algorithm, with its defaults; see `sb3_trainer` and `cloning`."""
 
 ENVS = {"ppo": 512, "residual": 256, "sac": 64, "td3": 64, "bc": 256}
 STEPS = {
@@ -43,10 +21,8 @@ STEPS = {
 SEGMENTS = {
     "ppo": 1_000_000, "residual": 250_000, "sac": 100_000, "td3": 100_000, "bc": 100_000,
 }  # fmt: skip
-ALGORITHMS = tuple(HYPERPARAMETERS)
-
-BASE = "lpv-nmpc"
-"""Origin of a residual's actions."""
+MOST_PATHS = 1000
+"""Random paths of one seed: the next seed's begin there."""
 
 FAST: dict[str, Any] = {
     "conditions": ("simulation",), "envs": 1024, "steps": 5_000_000,
@@ -78,7 +54,8 @@ class TrainingSettings:
     Raises
     ------
     ValueError
-        For an unknown name, a number out of its range, or a path of the benchmark's six.
+        For an unknown name, a number out of its range, segments in which nothing would be learned,
+        or a path that the benchmark drives.
     """
 
     algorithm: str
@@ -101,12 +78,14 @@ class TrainingSettings:
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "hyperparameters", _complete(self.algorithm, self.hyperparameters))
+        object.__setattr__(self, "hyperparameters", complete(self.algorithm, self.hyperparameters))
         object.__setattr__(self, "conditions", tuple(self.conditions))
         object.__setattr__(self, "trajectories", tuple(self.trajectories))
         for name in ("steps", "envs", "segment", "paths", "validation"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.paths > MOST_PATHS:
+            raise ValueError(f"paths must be at most {MOST_PATHS}, not {self.paths}")
         if not 0 <= self.seed < 1000:
             raise ValueError(f"seed must be in [0, 999], not {self.seed}")
         if not self.conditions:
@@ -116,15 +95,34 @@ class TrainingSettings:
         for given_conditions in self.conditions:
             conditions.load(given_conditions)
         for name in self.trajectories:
-            if name.removesuffix("-raw") in SIX:
+            if name.removesuffix("-raw") in (*SIX, *HELD_OUT):
                 raise ValueError(f"{name} is for evaluation: train on other paths")
         vehicle.load(self.vehicle)
         self.reward_weights()
+        self._check_segments()
+
+    def _check_segments(self) -> None:
+        """Refuse segments in which nothing is learned."""
+        least = self.envs * self.hyperparameters.get(
+            "rollout", self.hyperparameters.get("round", 1)
+        )
+        if self.segment < min(least, self.steps):
+            raise ValueError(
+                f"segment must be at least {least} steps, what {self.envs} environments drive "
+                f"before they learn of it, not {self.segment}"
+            )
+        if self.start is not None and "rollout" in self.hyperparameters and self.segments < 2:
+            raise ValueError(
+                "from a policy, the first segment fits the value function alone: "
+                f"segment must be less than steps, {self.steps}, not {self.segment}"
+            )
 
     def reward_weights(self) -> RewardWeights:
         """Reward that the training maximises."""
-        for key in self.reward:
+        for key, value in self.reward.items():
             choose("reward weight", key, tuple(item.name for item in fields(RewardWeights)))
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ValueError(f"reward weight {key} must be a number, not {value!r}")  # noqa: TRY004
         return RewardWeights(**self.reward)
 
     @property
@@ -137,8 +135,14 @@ class TrainingSettings:
         return min((number + 1) * self.segment, self.steps)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as JSON gives them back."""
-        plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        """Plain values, as JSON gives them back, and digests of the files that are named."""
+        named = [self.vehicle, *self.trajectories, *([self.start] if self.start else [])]
+        files = {
+            name: hashlib.sha256(Path(name).read_bytes()).hexdigest()
+            for name in named
+            if Path(name).is_file()
+        }
+        plain: dict[str, Any] = json.loads(json.dumps({**asdict(self), "files": files}))
         return plain
 
 
@@ -170,34 +174,3 @@ def difference(settings: TrainingSettings, stored: Mapping[str, Any]) -> str | N
         if stored.get(key) != value:
             return f"{key} is {value!r}, there {stored.get(key)!r}"
     return None
-
-
-def _complete(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Hyperparameters given, and the defaults of all others."""
-    known = HYPERPARAMETERS[choose("algorithm", algorithm, ALGORITHMS)]
-    for key, value in given.items():
-        choose(f"hyperparameter of {algorithm}", key, tuple(known))
-        _check_kind(key, value, known[key])
-    hyper = {**known, **given}
-    choose("activation", hyper["activation"], ACTIVATIONS)
-    if choose("origin", hyper["origin"], ORIGINS) == BASE != known["origin"]:
-        raise ValueError(f"only residual is trained on top of {BASE}, not {algorithm}")
-    return hyper
-
-
-def _check_kind(key: str, value: Any, usual_value: Any) -> None:
-    """Refuse a hyperparameter of another kind than its default, or no sensible number."""
-    if isinstance(usual_value, str):
-        good = isinstance(value, str)
-    elif isinstance(usual_value, list):
-        good = (
-            isinstance(value, list)
-            and bool(value)
-            and all(type(width) is int and 0 < width <= 4096 for width in value)
-        )
-    elif isinstance(usual_value, int):
-        good = type(value) is int and value > 0
-    else:
-        good = type(value) in {int, float} and math.isfinite(value) and value >= 0.0
-    if not good:
-        raise ValueError(f"hyperparameter {key} must be like {usual_value!r}, not {value!r}")

@@ -6,15 +6,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from agents.learned.learner import LearnerVecEnv
 from agents.learned.policy import Policy
-from agents.learned.scaling import Scaling
 from experiments.training.settings import TrainingSettings
 
 Layers = Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 
 def check_start(
-    policy: Policy, settings: TrainingSettings, scaling: Scaling, *, squash: str
+    policy: Policy, settings: TrainingSettings, env: LearnerVecEnv, *, squash: str
 ) -> None:
     """Refuse a policy that the training could not go on from.
 
@@ -23,6 +23,7 @@ def check_start(
     ValueError
         Naming what differs.
     """
+    scaling, layout = env.scaling, env.task.layout
     hidden = [len(bias) for _, bias in policy.layers[:-1]]
     same_scaling = all(
         np.array_equal(getattr(policy, name), getattr(scaling, name))
@@ -31,6 +32,8 @@ def check_start(
     wanted = settings.hyperparameters
     for name, own, other in (
         ("control period", settings.control_period, policy.control_period),
+        ("preview period", layout.preview_period, policy.layout.preview_period),
+        ("preview steps", layout.preview_steps, policy.layout.preview_steps),
         ("hidden layers", list(wanted["hidden"]), hidden),
         ("activation", wanted["activation"], policy.activation),
         ("squashing of outputs", squash, policy.squash),

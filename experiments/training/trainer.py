@@ -23,6 +23,9 @@ Tick = Callable[[int, str], None]
 class Trainer(ABC):
     """A training that goes on segment by segment, each a function of the state it begins with."""
 
+    device: torch.device
+    """Where it learns."""
+
     def __init__(self, settings: TrainingSettings, env: LearnerVecEnv) -> None:
         self.settings, self.env = settings, env
         self.hyper: Mapping[str, Any] = settings.hyperparameters
@@ -61,6 +64,7 @@ class Trainer(ABC):
         np.random.seed(seed)  # noqa: NPY002  where SB3 draws from
         torch.manual_seed(seed)
         self.random = np.random.default_rng(seed)
+        self.env.action_space.seed(seed)
         self.env.seed(episode_seed(self.settings, number))
 
     def rate(self) -> float:

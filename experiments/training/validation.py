@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from experiments.cases import Case, run_case
-from experiments.training.seeds import VALIDATION_PATHS, random_names
+from experiments.training.seeds import VALIDATION_EPISODES, validation_names
 from experiments.training.settings import TrainingSettings
 
 
@@ -19,7 +19,7 @@ def cases(settings: TrainingSettings, policy: Path) -> list[dict[str, Any]]:
             trajectory=name,
             vehicle=settings.vehicle,
             conditions=kind,
-            seed=k,
+            seed=VALIDATION_EPISODES + k,
             control_period=settings.control_period,
             env_settings={
                 "preview_steps": settings.preview_steps,
@@ -28,7 +28,7 @@ def cases(settings: TrainingSettings, policy: Path) -> list[dict[str, Any]]:
             },
         ).as_dict()
         for kind in settings.conditions
-        for k, name in enumerate(random_names(VALIDATION_PATHS, settings.validation))
+        for k, name in enumerate(validation_names(settings))
     ]
 
 
