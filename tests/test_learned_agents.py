@@ -505,3 +505,13 @@ def test_without_sb3_it_says_what_to_install(
     (tmp_path / "model.zip").write_bytes(b"")
     assert imported(tmp_path / "model.zip") == 2
     assert "pip install 'lpv-track-env[rl]'" in capsys.readouterr().err
+
+
+def test_another_vehicle_than_in_training_is_said_in_the_result(tmp_path: Path) -> None:
+    training = {"vehicle": "m2-minibus"}
+    policy = dataclasses.replace(driving_policy("linear"), training=training)
+    file = written(tmp_path, policy)
+    spec = {"agent": str(file), "trajectory": "u-turn"}
+    assert run_case(spec)["warnings"] == []
+    (said,) = run_case({**spec, "vehicle": "course-car"})["warnings"]
+    assert "was trained for vehicle 'm2-minibus', not for 'course-car'" in said

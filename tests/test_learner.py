@@ -143,6 +143,8 @@ def test_layouts_that_differ_are_refused() -> None:
         LearnerVecEnv([vec_env(1), vec_env(1, preview_steps=5)])
     with pytest.raises(ValueError, match="at least one"):
         LearnerVecEnv([])
+    with pytest.raises(TypeError, match=r"agents\.sb3_vec_env"):
+        LearnerVecEnv(PathTrackingVectorEnv(1, autoreset_mode="SameStep"))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("origin", ORIGINS)

@@ -20,6 +20,7 @@ from experiments.suites import HELD_OUT, SIX
 from experiments.training import checkpoint
 from experiments.training.environments import load_paths
 from experiments.training.hyperparameters import HYPERPARAMETERS
+from experiments.training.lock import alone_in
 from experiments.training.loop import Listener, make_trainer, train
 from experiments.training.seeds import (
     TRAINING_EPISODES,
@@ -37,6 +38,7 @@ from experiments.training.settings import (
     usual,
 )
 from experiments.training.validation import cases, validate
+from lpv_track_env.vehicle import VEHICLES
 
 TINY: dict[str, dict[str, Any]] = {
     "ppo": {"steps": 768, "hyperparameters": {"rollout": 16, "batch": 64}},
@@ -139,7 +141,7 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
     [
         ({"hyperparameters": {"learning_rat": 1.0}}, "learning_rate"),
         ({"hyperparameters": {"learning_rate": "fast"}}, "must be like"),
-        ({"hyperparameters": {"batch": 0}}, "must be like"),
+        ({"hyperparameters": {"batch": 0}}, "batch must be in"),
         ({"hyperparameters": {"hidden": []}}, "must be like"),
         ({"hyperparameters": {"discount": float("nan")}}, "must be like"),
         ({"hyperparameters": {"activation": "selu"}}, "relu"),
@@ -369,3 +371,30 @@ def test_what_fails_leaves_no_thread_behind(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="no space"):
         train(tiny("ppo"), tmp_path, Listener(silent, silent, full), command="test")
     assert threading.active_count() == before
+
+
+def test_a_file_that_changed_is_another_training(tmp_path: Path) -> None:
+    car = tmp_path / "mine.json"
+    car.write_text(json.dumps(VEHICLES["m2-minibus"].as_dict()))
+    settings = tiny("bc", vehicle=str(car))
+    stored = settings.as_dict()
+    assert list(stored["files"]) == [str(car)]
+    assert difference(settings, stored) is None
+    car.write_text(json.dumps(VEHICLES["course-car"].as_dict()))
+    assert "files is" in str(difference(settings, stored))
+
+
+def test_one_process_trains_in_a_folder(tmp_path: Path) -> None:
+    with alone_in(tmp_path), pytest.raises(ValueError, match="another process trains"):
+        run(tiny("bc"), tmp_path)
+    assert len(run(tiny("bc"), tmp_path)["lines"]) == 3
+
+
+def test_the_help_names_every_hyperparameter(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        command("--help")
+    said = " ".join(capsys.readouterr().out.split())
+    for algorithm, defaults in HYPERPARAMETERS.items():
+        assert algorithm in said
+        for name in defaults:
+            assert name in said

@@ -105,6 +105,9 @@ class LearnerVecEnv(VecEnv):
     both as `Scaling` says. Several vector environments, of different conditions say, are put one
     after another.
 
+    What learns sees the observation as it is; the policy that `policy_of` makes of it is symmetric,
+    so left and right are the same to it.
+
     Parameters
     ----------
     venvs
@@ -117,9 +120,15 @@ class LearnerVecEnv(VecEnv):
     def __init__(
         self, venvs: TrackingVecEnv | Sequence[TrackingVecEnv], scaling: Scaling | None = None
     ) -> None:
-        parts = [venvs] if isinstance(venvs, TrackingVecEnv) else list(venvs)
+        parts: list[Any] = list(venvs) if isinstance(venvs, list | tuple) else [venvs]
         if not parts:
             raise ValueError("LearnerVecEnv needs at least one vector environment")
+        for part in parts:
+            if not isinstance(part, TrackingVecEnv):
+                raise TypeError(
+                    f"LearnerVecEnv takes what agents.sb3_vec_env(env) returns, not a "
+                    f"{type(part).__name__}"
+                )
         tasks = [DrivingTask.of(part.env.single) for part in parts]
         kinds = {(task.layout, task.control_period) for task in tasks}
         if len(kinds) > 1:

@@ -9,7 +9,7 @@ from experiments.speed import peers, solvers
 from experiments.speed.measure import PREDICT, Effort, Section, Tick
 from experiments.suites import LEARNED
 
-BESIDE = "lpv-nmpc"
+NMPC = "lpv-nmpc"
 
 
 def policies(section: Section, effort: Effort, tick: Tick) -> None:
@@ -23,7 +23,7 @@ def policies(section: Section, effort: Effort, tick: Tick) -> None:
         tick(f"policies: recording {trajectory}")
         windows += solvers.record(trajectory, solvers.HORIZON, effort.windows, effort.window)
     env = solvers.environment(effort.trajectories[0])
-    made = {name: agents.make(name, env) for name in (*LEARNED, BESIDE)}
+    made = {name: agents.make(name, env) for name in (*LEARNED, NMPC)}
     series = {name: section.add(name, PREDICT) for name in made}
     for agent in made.values():
         solvers.solve_times(agent, windows[0])
