@@ -24,6 +24,7 @@ REGISTRY: dict[str, str] = {
     "lqr": "agents.lqr:LpvLqr",
     "pid": "agents.pid:Pid",
     "ppo": "agents.learned.agent:Ppo",
+    "sac": "agents.learned.agent:Sac",
     "bc": "agents.learned.agent:Bc",
 }
 """Name -> "module:Class"; the class takes a `DrivingTask` and its own keyword settings."""

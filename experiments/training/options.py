@@ -22,7 +22,11 @@ def add_training_options(train: argparse.ArgumentParser) -> None:
         help="budget in hours: as many steps as a trial says will fit, or --steps cut short",
     )  # fmt: skip
     train.add_argument("--resume", action="store_true", help="go on from DIR's last checkpoint")
-    train.add_argument("--fast", action="store_true", help="ppo: simulation only and large updates")
+    train.add_argument(
+        "--fast",
+        action="store_true",
+        help="ppo: simulation only, half the updates, less than a minute",
+    )
     train.add_argument("--vehicle", metavar="NAME", help="preset or .json (default m2-minibus)")
     train.add_argument(
         "--conditions", nargs="+", metavar="NAME",

@@ -24,12 +24,6 @@ SEGMENTS = {
 MOST_PATHS = 1000
 """Random paths of one seed: the next seed's begin there."""
 
-FAST: dict[str, Any] = {
-    "conditions": ("simulation",), "envs": 1024, "steps": 5_000_000,
-    "hyperparameters": {"batch": 16_384, "epochs": 2},
-}  # fmt: skip
-"""`--fast` of PPO: perfect knowledge only, and few, large updates."""
-
 REWARD = {
     "lateral_scale": 0.02, "heading": 0.1, "speed_scale": 0.5, "input_rate": 0.2,
 }  # fmt: skip
@@ -38,6 +32,12 @@ REWARD = {
 With 0.05 m, PPO ends at twice the error in simulation; with 0.02 m it takes longer to stay on the
 road at first.
 """
+
+FAST: dict[str, Any] = {
+    "conditions": ("simulation",), "steps": 5_000_000, "reward": {**REWARD, "lateral_scale": 0.05},
+    "hyperparameters": {"batch": 2048, "epochs": 2},
+}  # fmt: skip
+"""`--fast` of PPO: perfect knowledge only, half as many updates, and a reward to begin with."""
 
 
 @dataclass(frozen=True)
