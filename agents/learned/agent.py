@@ -1,6 +1,7 @@
 """Agents that run a learned policy: compiled, without torch."""
 
 import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -116,8 +117,7 @@ def _check_task(name: str, policy: Policy, task: DrivingTask) -> None:
     if not same_period:
         raise ValueError(
             f"{name} acts every {policy.control_period:g} s, this environment every "
-            f"{task.control_period:g}: make the environment with {period} (run-parallel: --rate "
-            f"{1.0 / policy.control_period:g}), or train one for it"
+            f"{task.control_period:g}: make the environment with {period}, or train one for it"
         )
     trained = policy.training.get("vehicle")
     if isinstance(trained, str) and trained != task.vehicle.name:
