@@ -1,5 +1,6 @@
 """Training: exact, resumable, honest about what it trains on, and it learns."""
 
+import importlib.util
 import io
 import json
 import threading
@@ -398,3 +399,17 @@ def test_the_help_names_every_hyperparameter(capsys: pytest.CaptureFixture[str])
         assert algorithm in said
         for name in defaults:
             assert name in said
+
+
+def test_without_the_extra_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = importlib.util.find_spec
+    lacking = {"stable_baselines3", "tensorboard"}
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name in lacking else found(name)
+    )
+    assert command("ppo", "--out", str(tmp_path)) == 2
+    error = capsys.readouterr().err
+    assert "stable_baselines3, tensorboard: pip install 'lpv-track-env[rl]'" in error
+    assert error.count("\n") == 1
