@@ -2,15 +2,20 @@
 
 import dataclasses
 import functools
+import hashlib
 import itertools
+import json
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from agents.learned import Policy, write
+from agents.learned import Policy, read, write
+from agents.learned.network import Network
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.vehicle import VEHICLES
 
@@ -85,6 +90,50 @@ def plain_act(policy: Policy, rows: NDArray[Any], base: NDArray[Any]) -> NDArray
     x = x @ weight.T.astype(np.float64) + bias
     u = np.tanh(x) if policy.squash == "tanh" else np.clip(x, -1.0, 1.0)
     return base + policy.centre + policy.half * u
+
+
+def act(policy: Policy, rows: NDArray[Any], base: NDArray[Any], bound: float = 1e6) -> Any:
+    """What the compiled network does, its actions bounded to +- `bound`."""
+    actions = np.array(base, dtype=np.float64)
+    network = Network.of(policy, np.full(2, -bound), np.full(2, bound))
+    assert network.act(rows, actions) == np.isnan(actions).any(axis=1).sum()
+    return actions
+
+
+def observations(n: int, seed: int = 0) -> NDArray[np.float64]:
+    rows = np.random.default_rng(seed).normal(size=(n, 48)) * 3.0
+    return rows.astype(np.float32).astype(np.float64)
+
+
+# Files with something else in them.
+
+
+def refusal(file: Path) -> str:
+    """What reading says: one line that names a file."""
+    with pytest.raises(ValueError, match=file.stem) as raised:
+        read(file)
+    said = str(raised.value)
+    assert "\n" not in said
+    assert file.stem in said
+    return said
+
+
+def change(file: Path, edit: Callable[[dict[str, Any]], Any], *, digest: bool = True) -> None:
+    """Edit a spec, with the digest that then belongs to it."""
+    spec = json.loads(file.read_text())
+    edit(spec)
+    if digest:
+        spec.pop("digest", None)
+        canonical = json.dumps(spec, sort_keys=True, separators=(",", ":"))
+        spec["digest"] = hashlib.sha256(canonical.encode()).hexdigest()
+    file.write_text(json.dumps(spec))
+
+
+def put_weights(file: Path, content: bytes) -> None:
+    """Other weights, with the digests that then belong to them."""
+    file.with_suffix(".safetensors").write_bytes(content)
+    sha = hashlib.sha256(content).hexdigest()
+    change(file, lambda spec: spec["weights"].update(sha256=sha, bytes=len(content)))
 
 
 # Policies that drive `m2-minibus`: feedback written down as a network.

@@ -18,7 +18,7 @@ from agents.learned.files import read as read_policy
 from experiments import cli
 from experiments.cases import run_case
 from experiments.suites import HELD_OUT, SIX
-from experiments.training import checkpoint
+from experiments.training import checkpoint, options
 from experiments.training.environments import load_paths
 from experiments.training.hyperparameters import HYPERPARAMETERS
 from experiments.training.lock import alone_in
@@ -395,6 +395,7 @@ def test_the_help_names_every_hyperparameter(capsys: pytest.CaptureFixture[str])
     with pytest.raises(SystemExit):
         command("--help")
     said = " ".join(capsys.readouterr().out.split())
+    assert sorted(options.ALGORITHMS) == sorted(ALGORITHMS)
     for algorithm, defaults in HYPERPARAMETERS.items():
         assert algorithm in said
         for name in defaults:

@@ -74,7 +74,6 @@ class Display:
         self._console, self._settings = console, settings
         self.progress: Progress = progress_bar(console)
         self._bar = self.progress.add_task("paths", total=None)
-        self._training = False
 
     def loading(self, done: int, count: int) -> None:
         """So many paths are loaded."""
