@@ -67,7 +67,7 @@ class NearFuture:
         vehicle = model or task.vehicle
         drive = actuation.computing_delay + actuation.drive_dead_time
         steering = actuation.computing_delay + actuation.steering_dead_time
-        self._settings = np.array(
+        self.settings = np.array(
             [
                 drive,
                 actuation.drive_lag,
@@ -81,20 +81,19 @@ class NearFuture:
                 *vehicle.as_array(),
             ]
         )
-        self._kept = math.ceil(max(drive, steering) / task.control_period) + 1
+        self.kept = math.ceil(max(drive, steering) / task.control_period) + 1
+        """Commands that must be remembered."""
         self._nodes = np.zeros((task.layout.preview_steps + 1, NODE))
 
     def memory(self, n: int) -> "DelayMemory":
         """Memory of n vehicles before their first observations."""
-        return DelayMemory(None, np.zeros((n, self._kept, 2)), np.zeros((n, delay_kernels.FOOT)))
+        return DelayMemory(None, np.zeros((n, self.kept, 2)), np.zeros((n, delay_kernels.FOOT)))
 
     def look(self, rows: Array, starts: NDArray[np.bool_], memory: "DelayMemory") -> None:
         """Move observations, rows (n, size) float64, in place; `starts` (n,) begin episodes."""
         # Before the first command the actuators have stood where they are.
         memory.commands[starts] = np.nan_to_num(rows[starts, None, 3:5])
-        delay_kernels.look_ahead_all(
-            rows, memory.commands, self._settings, self._nodes, memory.feet
-        )
+        delay_kernels.look_ahead_all(rows, memory.commands, self.settings, self._nodes, memory.feet)
 
     @staticmethod
     def note(memory: "DelayMemory", actions: NDArray[Any] | None) -> None:
@@ -129,7 +128,7 @@ class DelayCompensated:
         model: VehicleParameters | None = None,
     ) -> None:
         self.agent, self.task, self.actuation = agent, task, actuation
-        self._future = NearFuture(task, actuation, model)
+        self.future = NearFuture(task, actuation, model)
         self._memory: DelayMemory | None = None
 
     def __getattr__(self, name: str) -> Any:
@@ -161,21 +160,21 @@ class DelayCompensated:
         if episode_start is not None:
             starts |= np.broadcast_to(np.asarray(episode_start, dtype=bool), (n,))
         if memory is None or len(memory) != n:
-            memory = self._future.memory(n)
+            memory = self.future.memory(n)
             starts[:] = True
         if state is None:
             self._memory = memory
-        self._future.look(rows, starts, memory)
+        self.future.look(rows, starts, memory)
         seen = rows[0] if given.ndim == 1 else rows
         action, memory.inner = self.agent.predict(seen, memory.inner, starts, deterministic)
-        self._future.note(memory, np.atleast_2d(action))
+        self.future.note(memory, np.atleast_2d(action))
         return action, memory
 
     def hold(self, memory: DelayMemory | None = None) -> None:
         """Let a control period pass in which nothing was computed: the last command stays."""
         held = self._memory if memory is None else memory
         if held is not None:
-            self._future.note(held, None)
+            self.future.note(held, None)
 
     def diagnostics(self, memory: DelayRow) -> dict[str, Any]:
         """What the agent tells of its last step, its plan moved to where it belongs."""

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 LOWEST, HIGHEST = 1e-4, 1e6
 """Bounds of every weight; `TrackingWeights.clipped` brings others within them."""
-FORMAT = "weight-schedule/1"
+FORMAT, WITHOUT_SLEW = "weight-schedule/2", "weight-schedule/1"
 
 
 @dataclass(frozen=True)
@@ -84,18 +84,23 @@ class WeightSchedule:
     blend
         Half width, as a share of a threshold, of the zone around it in which the two sets are
         blended geometrically; 0 switches hard, with the bands' hysteresis.
+    slew
+        Largest change of every weight's natural logarithm, 1/s, from the set in use towards the
+        one that is chosen; None does not limit it.
     provenance
         Where the numbers come from, plain JSON values.
 
     Raises
     ------
     ValueError
-        If the number of sets does not fit the bands, or blending zones would overlap.
+        If the number of sets does not fit the bands, blending zones would overlap, or the slew
+        limit is not positive.
     """
 
     bands: CurvatureBands
     weights: tuple[TrackingWeights, ...]
     blend: float = 0.0
+    slew: float | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -107,6 +112,8 @@ class WeightSchedule:
             or (edges[1:] * (1.0 - self.blend) < edges[:-1] * (1.0 + self.blend)).any()
         ):
             raise ValueError(f"blend {self.blend} must be in [0, 1) and its zones must not overlap")
+        if self.slew is not None and not self.slew > 0.0:
+            raise ValueError(f"slew must be positive, not {self.slew}")
 
     def for_path(self, path: ReferencePath) -> TrackingWeights:
         """The paper's rule: one set, chosen by the path's sharpest curvature."""
@@ -134,6 +141,7 @@ class WeightSchedule:
             "bands": dataclasses.asdict(self.bands),
             "weights": [dataclasses.asdict(weights) for weights in self.weights],
             "blend": self.blend,
+            "slew": self.slew,
             "provenance": dict(self.provenance),
         }
         write_atomically(Path(file), json.dumps(content, indent=2).encode())
@@ -149,9 +157,9 @@ class WeightSchedule:
         """
         try:
             content = json.loads(Path(file).read_text(encoding="utf-8"))
-            if content.get("format") != FORMAT:
+            if content.get("format") not in (FORMAT, WITHOUT_SLEW):
                 raise ValueError(f"format is {content.get('format')!r}, not {FORMAT!r}")
-            bands = content["bands"]
+            bands, slew = content["bands"], content.get("slew")
             return cls(
                 CurvatureBands(
                     thresholds=tuple(float(edge) for edge in bands["thresholds"]),
@@ -160,6 +168,7 @@ class WeightSchedule:
                 ),
                 tuple(TrackingWeights(**weights) for weights in content["weights"]),
                 float(content["blend"]),
+                None if slew is None else float(slew),
                 dict(content["provenance"]),
             )
         except KeyError as error:

@@ -137,6 +137,11 @@ class ConditionsVector:
             [layout.spec_of(self._conditions, task.vehicle, self._period) for task in tasks]
         )
 
+    def arrays(self, keys: Array, episodes: Array) -> tuple[Array, Array, Array]:
+        """Vehicles, specs and draws as `drive_under_conditions` takes them, not copies."""
+        self.draws[:, 0], self.draws[:, 1] = keys, episodes
+        return self.vehicles, self.specs, self.draws
+
     def advance(self, mode: int, keys: Array, episodes: Array, arguments: Any) -> None:
         """Drive a control period; `arguments` are `advance`'s from `memories` on."""
         self.draws[:, 0], self.draws[:, 1] = keys, episodes

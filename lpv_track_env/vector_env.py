@@ -228,6 +228,18 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         """Whether every environment has had a reset."""
         return bool(self._episodes.min() >= 0)
 
+    def copy(self, source: Array, target: Array) -> None:
+        """Make environments `target` (m,) those that `source` (m,) are: state, seeds, disturbances.
+
+        From there on the same actions lead to the same, until the next reset with another seed.
+        """
+        for array in (
+            self._memories, self._observations, self._ends, self._cases, self._keys, self._episodes,
+        ):  # fmt: skip
+            array[target] = array[source]
+        if self._conditioned is not None:
+            self._conditioned.vehicles[target] = self._conditioned.vehicles[source]
+
     @property
     def single(self) -> PathTrackingEnv:
         """A single environment of the same settings, the first path and vehicle: for agents."""
@@ -240,6 +252,16 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             self._memories, self._observations, self._ends, self._cases, self._constants,
             self._tables, self._rows,
         )  # fmt: skip
+
+    @property
+    def condition_arrays(self) -> tuple[Array, Array, Array] | None:
+        """The same of what conditions add: vehicles (n, size), specs (cases, SPEC), draws (n, 2).
+
+        See `conditions_layout`; None under conditions `simulation`.
+        """
+        if self._conditioned is None:
+            return None
+        return self._conditioned.arrays(self._keys, self._episodes)
 
     @property
     def memories(self) -> Array:

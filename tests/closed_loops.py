@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 import agents
 from agents.nmpc.closed_loop import ClosedLoop, Tally
 from agents.nmpc.rti_agent import RtiNmpc
+from lpv_track_env import conditions_layout as layout
 from lpv_track_env import kernels as k
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 
@@ -41,15 +42,23 @@ def weights_of(n: int) -> Array:
     return WEIGHTS * 10.0 ** np.random.default_rng(0).uniform(-0.7, 0.7, (n, 10))
 
 
+def busy(env: PathTrackingVectorEnv) -> bool:
+    """Whether the controller of a single environment still computes an earlier action."""
+    if (given := env.condition_arrays) is None:
+        return False
+    now = env.memories[0, k.STEPS] * env.single.control_period
+    return bool(given[0][0, layout.FREE_AT] > now + layout.INSTANT)
+
+
 class InTurns:
     """n environments of one each, with an agent each: `predict`, then `step`, in Python."""
 
     def __init__(self, n: int, settings: dict[str, Any], sets: Array | None, **more: Any) -> None:
         self.envs = [environments(1, **settings) for _ in range(n)]
-        self.agents: list[RtiNmpc] = []
+        self.agents: list[Any] = []
         for i, env in enumerate(self.envs):
-            agent = agents.make("lpv-nmpc", env.single, **more)
-            assert isinstance(agent, RtiNmpc)
+            agent: Any = agents.make("lpv-nmpc", env.single, **more)
+            assert isinstance(getattr(agent, "agent", agent), RtiNmpc)
             assert sets is None or agent.set_weights(sets[i])
             self.agents.append(agent)
         self.failures, self.iterations = np.zeros(n), np.zeros(n)
@@ -67,12 +76,15 @@ class InTurns:
             for period in range(periods):
                 if env.arrays.ends[0] != k.RUNNING:
                     break
-                # A copy: tests put what they like in place of what is seen.
-                actions, memory = agent.predict(env.arrays.observations.copy())
-                told = agent.diagnostics(memory[0])
-                self.failures[i] += told["status"] != "SUCCESS"
-                self.iterations[i] += told["iterations"]
-                self.fallbacks[i] = told["fallback"]
+                if busy(env):
+                    agent.hold()
+                else:
+                    # A copy: tests put what they like in place of what is seen.
+                    actions, memory = agent.predict(env.arrays.observations.copy())
+                    told = agent.diagnostics(memory[0])
+                    self.failures[i] += told["status"] != "SUCCESS"
+                    self.iterations[i] += told["iterations"]
+                    self.fallbacks[i] = told["fallback"]
                 env.step(actions)
                 trace[i, period] = env.memories[0]
         return trace
@@ -85,6 +97,6 @@ def assert_same(loop: ClosedLoop, turns: InTurns) -> None:
         assert loop.envs.arrays.ends[i] == env.arrays.ends[0]
 
 
-def traced(loop: ClosedLoop, periods: int, weights: Any = None) -> tuple[Tally, Array]:
+def traced(loop: ClosedLoop, periods: int, weights: Any = None, **more: Any) -> tuple[Tally, Array]:
     trace = np.full((loop.envs.num_envs, periods, k.MEMORY_SIZE), np.nan)
-    return loop.drive(periods, weights, trace=trace), trace
+    return loop.drive(periods, weights, trace=trace, **more), trace

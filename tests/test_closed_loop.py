@@ -1,15 +1,32 @@
 """Closed loops in compiled code against `predict` and `step` in turns, bit for bit."""
 
+from typing import Any
+
 import numba
 import numpy as np
 import pytest
-from closed_loops import CALM, LIVELY, InTurns, assert_same, loop_of, traced, weights_of
+from closed_loops import (
+    CALM,
+    LIVELY,
+    InTurns,
+    assert_same,
+    environments,
+    loop_of,
+    traced,
+    weights_of,
+)
 from nmpc_situations import WEIGHTS
 
-from agents.nmpc.closed_loop import Tally, drive_rows
-from agents.weights import TrackingWeights
+import agents
+from agents.nmpc.closed_loop import ClosedLoop, Tally
+from agents.nmpc.closed_loop_kernels import drive_rows
+from agents.nmpc.rti_agent import RtiMemory
+from agents.weights import TrackingWeights, WeightSchedule
+from lpv_track_env import conditions_layout as layout
 from lpv_track_env import kernels as k
+from lpv_track_env.conditions import REALTIME
 from lpv_track_env.vehicle import M2_MINIBUS
+from trajectories import CurvatureBands
 
 # Equality ------------------------------------------------------------------------------------
 
@@ -143,6 +160,134 @@ def test_reset_of_some_and_with_options() -> None:
     np.testing.assert_array_equal(traced(loop, 8)[1], turns.drive(8))
 
 
+def agent_memory(agent: Any) -> RtiMemory:
+    """Own memory of an agent of `InTurns`, with delay compensation around it or not."""
+    memory: RtiMemory = agent._memory.inner if hasattr(agent, "future") else agent._memory
+    return memory
+
+
+# Conditions and schedules --------------------------------------------------------------------
+
+SLOW_COMPUTER = REALTIME.replace(computing_delay=(0.03, 0.09))
+
+
+@pytest.mark.parametrize("conditions", ["realtime", "ideal", SLOW_COMPUTER], ids=str)
+def test_conditions_too_are_predict_and_step_in_turns(conditions: Any) -> None:
+    """Delay compensation, drawn vehicles, the filter; a computer that misses its deadlines."""
+    settings = {**LIVELY, "conditions": conditions, "max_lateral_error": 1.5}
+    weights = weights_of(9)
+    loop, turns = loop_of(9, settings), InTurns(9, settings, weights)
+    loop.reset(seed=5)
+    turns.reset(seed=5)
+    for _ in range(2):
+        tally, trace = traced(loop, 25, weights)
+        np.testing.assert_array_equal(trace, turns.drive(25))
+        assert_same(loop, turns)
+        np.testing.assert_array_equal(tally.failures, turns.failures)
+        assert tally.steps.max() > 10
+        turns.failures[:] = 0.0
+        if (ended := ~loop.running).any():
+            loop.reset(options={"reset_mask": ended})
+            turns.reset(np.flatnonzero(ended))
+    given = loop.envs.condition_arrays
+    assert given is not None
+    assert given[0][:, layout.MISSES].any() == (conditions is SLOW_COMPUTER)
+
+
+def test_failing_solves_under_conditions_are_those_of_predict() -> None:
+    settings = {**CALM, "conditions": "realtime"}
+    loop, turns = loop_of(3, settings, max_failures=3), InTurns(3, settings, None, max_failures=3)
+    loop.reset(seed=9)
+    turns.reset(seed=9)
+    for period in range(10):
+        if 3 <= period < 8:
+            loop.envs.arrays.observations[1, 5] = np.nan
+            turns.envs[1].arrays.observations[0, 5] = np.nan
+        turns.failures[:] = 0.0
+        tally, trace = traced(loop, 1)
+        np.testing.assert_array_equal(trace, turns.drive(1))
+        np.testing.assert_array_equal(tally.failures, turns.failures)
+        assert tally.failures[1] == (3 <= period < 8)
+
+
+@pytest.mark.parametrize("conditions", ["simulation", "realtime"])
+@pytest.mark.parametrize("more", [{}, {"slew": 2.0}, {"blend": 0.3, "slew": 5.0}], ids=str)
+def test_a_schedule_is_followed_as_predict_does(conditions: str, more: dict[str, Any]) -> None:
+    sets = tuple(TrackingWeights(R=(0.01, scale)) for scale in (1.0, 10.0, 100.0, 1000.0))
+    schedule = WeightSchedule(CurvatureBands(), sets, **more)
+    settings = {**CALM, "conditions": conditions}
+    loop, turns = (
+        loop_of(3, settings, weights=schedule),
+        InTurns(3, settings, None, weights=schedule),
+    )
+    loop.reset(seed=1)
+    turns.reset(seed=1)
+    for _ in range(3):
+        np.testing.assert_array_equal(traced(loop, 20)[1], turns.drive(20))
+    used = np.concatenate([agent_memory(agent).weights for agent in turns.agents])
+    np.testing.assert_array_equal(loop.memory.weights, used)
+    assert len(set(used[:, 9])) > 1
+
+
+def test_tables_with_a_set_for_each_band_are_a_schedule() -> None:
+    sets = tuple(TrackingWeights(R=(0.01, scale)) for scale in (1.0, 10.0, 100.0, 1000.0))
+    bands = CurvatureBands()
+    followed = loop_of(3, CALM, weights=WeightSchedule(bands, sets, slew=3.0))
+    envs = environments(3, **CALM)
+    told = ClosedLoop(envs, agents.make("lpv-nmpc", envs.single), bands=bands, slew=3.0)
+    table = np.array([one.as_array() for one in sets])
+    for loop in (followed, told):
+        loop.reset(seed=1)
+    given = np.tile(table, (3, 1, 1))
+    np.testing.assert_array_equal(told.drive(60, given), followed.drive(60))
+    np.testing.assert_array_equal(told.memory.weights, followed.memory.weights)
+
+
+def test_until_band_stops_where_the_band_changes() -> None:
+    envs = environments(5, **CALM, conditions="realtime")
+    bands = CurvatureBands()
+    stopping = ClosedLoop(envs, agents.make("lpv-nmpc", envs.single), bands=bands)
+    whole = loop_of(5, {**CALM, "conditions": "realtime"})
+    stopping.reset(seed=3)
+    whole.reset(seed=3)
+    _, trace = traced(whole, 60)
+    driven = np.zeros(5, dtype=np.int64)
+    stops = 0
+    while (driven < 60).any():
+        before = stopping.memory.bands.copy()
+        tally, piece = traced(stopping, 60, WEIGHTS, until_band=True)
+        steps = tally.steps.astype(np.int64)
+        assert steps.min() >= 1
+        for row in range(5):
+            count = min(steps[row], 60 - driven[row])
+            np.testing.assert_array_equal(
+                piece[row, :count], trace[row, driven[row] : driven[row] + count]
+            )
+            # Bands last: it has not changed within the piece, and has after all but the last.
+            assert steps[row] == 60 or stops == 0 or before[row] != stopping.memory.bands[row]
+        driven += steps
+        stops += 1
+    assert stops > 1
+
+
+def test_copies_drive_as_their_originals() -> None:
+    settings = {**CALM, "conditions": "realtime"}
+    loop = loop_of(6, settings)
+    loop.reset(seed=2)
+    loop.envs.arrays.observations[1, 5] = np.nan
+    loop.drive(15)
+    loop.copy([0, 1, 0], [3, 4, 5])
+    assert loop.memory.ladders[4].counts == loop.memory.ladders[1].counts
+    weights = weights_of(2)[[0, 1, 0, 0, 1, 0]]
+    tally, trace = traced(loop, 30, weights)
+    for original, image in ((0, 3), (1, 4), (0, 5)):
+        np.testing.assert_array_equal(trace[image], trace[original])
+        assert [values[image] for values in tally] == [values[original] for values in tally]
+    loop.copy([0], [2])
+    _, trace = traced(loop, 10, np.array([WEIGHTS, WEIGHTS, 2.0 * WEIGHTS, *weights[3:]]))
+    assert not np.array_equal(trace[2], trace[0])
+
+
 # What is told --------------------------------------------------------------------------------
 
 
@@ -170,6 +315,7 @@ def test_tally_is_the_sums_over_the_trace() -> None:
             max_lateral=np.abs(lateral).max(), max_heading=np.abs(heading).max(),
             steering_variation=np.abs(change[:, 1]).sum(), failures=turns.failures[i],
             clipped=np.count_nonzero(rows[:, k.CLIPPED]), iterations=turns.iterations[i],
+            solves=len(rows),
         )  # fmt: skip
         found = [values[i] for values in tally]
         np.testing.assert_allclose(found, wanted, rtol=1e-11, atol=1e-14)

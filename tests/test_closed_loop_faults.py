@@ -10,9 +10,7 @@ from nmpc_situations import WEIGHTS
 
 import agents
 from agents.nmpc.closed_loop import ClosedLoop
-from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env import kernels as k
-from trajectories import CurvatureBands
 
 # Failing solves ------------------------------------------------------------------------------
 
@@ -158,19 +156,3 @@ def test_a_drive_before_the_first_reset_is_refused() -> None:
     loop = loop_of(2, CALM)
     with pytest.raises(gymnasium.error.ResetNeeded):
         loop.drive(3)
-
-
-def test_a_schedule_is_followed_or_refused() -> None:
-    """An agent that chooses weights by curvature must not be driven with others in silence."""
-    sets = tuple(TrackingWeights(R=(0.01, scale)) for scale in (1.0, 10.0, 100.0, 1000.0))
-    schedule = WeightSchedule(CurvatureBands(), sets)
-    turns = InTurns(3, CALM, None, weights=schedule)
-    turns.reset(seed=1)
-    try:
-        loop = loop_of(3, CALM, weights=schedule)
-        loop.reset(seed=1)
-        trace = traced(loop, 10)[1]
-    except ValueError as error:
-        assert "schedule" in str(error)  # noqa: PT017
-    else:
-        np.testing.assert_array_equal(trace, turns.drive(10))

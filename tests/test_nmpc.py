@@ -410,20 +410,20 @@ def test_bad_weights_are_refused_and_counted(
     nmpc: tuple[gymnasium.Env, Any], weights: object
 ) -> None:
     _, agent = nmpc
-    before, refused = agent._weights.copy(), agent.rejected_weights
+    before, refused = agent.fixed_weights.copy(), agent.rejected_weights
     assert agent.set_weights(weights) is False
     assert agent.rejected_weights == refused + 1
-    np.testing.assert_array_equal(agent._weights, before)
+    np.testing.assert_array_equal(agent.fixed_weights, before)
 
 
 def test_huge_weights_are_clipped(nmpc: tuple[gymnasium.Env, Any]) -> None:
     _, agent = nmpc
-    before = agent._weights.copy()
+    before = agent.fixed_weights[0].copy()
     try:
         assert agent.set_weights([1e12] * 10)
-        assert (agent._weights == 1e6).all()
+        assert (agent.fixed_weights == 1e6).all()
     finally:
-        agent._weights = before
+        assert agent.set_weights(before)
 
 
 def test_schedule_by_band_and_by_path(nmpc: tuple[gymnasium.Env, Any]) -> None:
@@ -433,13 +433,13 @@ def test_schedule_by_band_and_by_path(nmpc: tuple[gymnasium.Env, Any]) -> None:
     schedule = WeightSchedule(CurvatureBands(), sets)
     by_path = cls(DrivingTask.of(env), weights=schedule, selection="path")
     # The U-turn's sharpest curvature is 0.1 1/m: the sharp band.
-    np.testing.assert_array_equal(by_path._weights, sets[3].as_array())
+    np.testing.assert_array_equal(by_path.fixed_weights[0], sets[3].as_array())
     by_band = cls(DrivingTask.of(env), weights=schedule)
     bands = set()
     for s in (0.0, 45.0):
         observation, _ = env.reset(options={"arc_length": s})
         _, memory = by_band.predict(observation, episode_start=np.array([True]))
-        bands.add(memory.bands[0] if hasattr(memory, "bands") else memory[0].band)
+        bands.add(int(memory.bands[0] if hasattr(memory, "bands") else memory[0].band[0]))
     assert bands == {0, 3}
 
 

@@ -173,7 +173,9 @@ def test_overlapping_zones_are_refused(blend: float) -> None:
 
 def test_file_round_trip(tmp_path: Path) -> None:
     file = tmp_path / "new" / "schedule.json"
-    written = schedule(0.3, provenance={"tuner": "random search", "seed": 3, "é": [1.5, None]})
+    written = schedule(
+        0.3, slew=4.0, provenance={"tuner": "random search", "seed": 3, "é": [1.5, None]}
+    )
     written.write(file)
     assert WeightSchedule.read(file) == written
     schedule().write(file)
@@ -196,7 +198,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path) -> None
 
 def content() -> dict[str, Any]:
     written: dict[str, Any] = {
-        "format": "weight-schedule/1",
+        "format": "weight-schedule/2",
         "bands": {
             "thresholds": list(EDGES),
             "names": ["straight", "gentle", "moderate", "sharp"],
@@ -204,6 +206,7 @@ def content() -> dict[str, Any]:
         },
         "weights": [{"Q": [*one.Q], "S": [*one.S], "R": [*one.R]} for one in SETS],
         "blend": 0.0,
+        "slew": None,
         "provenance": {},
     }
     return written
@@ -228,10 +231,21 @@ def test_the_content_below_is_one_that_is_read(tmp_path: Path) -> None:
     assert WeightSchedule.read(file) == schedule()
 
 
+def test_files_from_before_the_slew_limit_are_read(tmp_path: Path) -> None:
+    older = content()
+    older["format"] = "weight-schedule/1"
+    del older["slew"]
+    file = tmp_path / "schedule.json"
+    file.write_text(json.dumps(older))
+    assert WeightSchedule.read(file) == schedule()
+
+
 @pytest.mark.parametrize(
     ("place", "value", "reason"),
     [
-        (("format",), "weight-schedule/2", "format is 'weight-schedule/2'"),
+        (("format",), "weight-schedule/3", "format is 'weight-schedule/3'"),
+        (("slew",), 0.0, "slew must be positive, not 0.0"),
+        (("slew",), "fast", "could not convert"),
         (("weights", 0, "Q", 2), -1.0, "Q must be finite and not negative"),
         (("weights", 1, "S"), [1.0], "S needs 4 weights, not 1"),
         (("weights", 1, "R", 0), "heavy", "could not convert"),

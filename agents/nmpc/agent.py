@@ -1,6 +1,6 @@
 """The LPV-NMPC as an agent, solved to convergence: the reference for what is fast."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,6 +11,7 @@ from agents.nmpc.base import Ladder, NmpcAgent
 from agents.nmpc.casadi_solver import CasadiSolver
 from agents.nmpc.fatrop_solver import FatropSolver
 from agents.nmpc.problem import Solution, Status
+from agents.nmpc.switching import NO_BAND, WEIGHTS
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.naming import choose
 from lpv_track_env.observation import TrackingObservation
@@ -34,7 +35,9 @@ class NmpcMemory:
     """Periods since that plan was made."""
     failures: int = 0
     """Failed solves in a row."""
-    band: int | None = None
+    band: NDArray[np.int64] = field(default_factory=lambda: np.full(1, NO_BAND))
+    weights: Array = field(default_factory=lambda: np.zeros((1, WEIGHTS)))
+    """In use, of zeros before the first step."""
     solution: Solution | None = None
 
 
@@ -65,13 +68,9 @@ class SolvedNmpc(NmpcAgent[NmpcMemory]):
     def control(self, observation: TrackingObservation, memory: NmpcMemory) -> tuple[float, float]:
         """First input of the plan, or what replaces it."""
         state, last, reference = self.situation(observation)
-        weights = self._weights
-        if self._schedule is not None:
-            chosen, memory.band = self._schedule.select(
-                observation.preview_curvature[: self.problem.horizon], memory.band
-            )
-            weights = chosen.clipped().as_array()
-        solution, warm = self.solver.solve(state, last, reference, weights, memory.warm)
+        flat = np.concatenate([np.ravel(entry) for entry in observation]).astype(np.float64)
+        self.switching.choose(flat[None], self.problem.horizon, memory.band, memory.weights)
+        solution, warm = self.solver.solve(state, last, reference, memory.weights[0], memory.warm)
         memory.solution = solution
         if solution.status is Status.SUCCESS and solution.inputs is not None:
             memory.warm, memory.plan, memory.age, memory.failures = warm, solution.inputs, 0, 0

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from agents.base import DrivingTask, TrackingAgent
 from agents.geometric import Stanley
 from agents.nmpc.problem import NmpcProblem
+from agents.nmpc.switching import Switching
 from agents.reference import local_reference
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import TrackingObservation
@@ -67,22 +68,17 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
         )
         self.max_failures = max_failures
         self._fallback = Stanley(task)
-        self._schedule: WeightSchedule | None = None
-        self._weights = TrackingWeights().as_array()
         self.rejected_weights = 0
-        if isinstance(weights, WeightSchedule):
-            if selection == "path":
-                self.set_weights(weights.for_path(task.path).as_array())
-            else:
-                self._schedule = weights
-        elif weights is not None:
-            self.set_weights(weights.as_array())
+        if isinstance(weights, WeightSchedule) and selection == "path":
+            weights = weights.for_path(task.path)
+        self.switching = Switching(weights or TrackingWeights(), task.control_period)
 
     def set_weights(self, weights: TrackingWeights | ArrayLike) -> bool:
         """Take new weights, (10,) as Q, S, R, from the next step on; the warm start is kept.
 
-        Values out of bounds are clipped to them; a vector that is not finite, negative or of the
-        wrong size is refused: the weights stay, `rejected_weights` counts it, False is returned.
+        A schedule is followed no longer then. Values out of bounds are clipped to them; a vector
+        that is not finite, negative or of the wrong size is refused: the weights stay,
+        `rejected_weights` counts it, False is returned.
         """
         try:
             values = (
@@ -93,8 +89,20 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
         except (ValueError, TypeError):
             self.rejected_weights += 1
             return False
-        self._weights = values.clipped().as_array()
+        self.switching = Switching(values, self.task.control_period)
         return True
+
+    @property
+    def has_schedule(self) -> bool:
+        """Whether weights are chosen by curvature at every step."""
+        sets: int = self.switching.tables.shape[1]
+        return sets > 1
+
+    @property
+    def fixed_weights(self) -> Array:
+        """Q, S, R in use where no schedule chooses, (1, 10)."""
+        weights: Array = self.switching.tables[:, 0]
+        return weights
 
     def new_ladder(self) -> Ladder:
         """For a vehicle that no solve has failed for."""

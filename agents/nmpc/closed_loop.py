@@ -1,35 +1,34 @@
 """Closed loops in compiled code: n environments, each with its NMPC and its own weights.
 
 For tuning weights and for sweeps: one call drives every environment K control periods. What happens
-in each is bit for bit what `RtiNmpc.predict` and the environment's `step` would have done in turns,
-whatever n is and however many threads share the work.
+in each is bit for bit what the agent's `predict` and the environment's `step` would have done in
+turns, under every kind of conditions, whatever n is and however many threads share the work.
 """
 
+import copy
+import math
 import operator
 from typing import Any, NamedTuple
 
 import gymnasium
-import numba
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from agents.nmpc import rti
+from agents.delay import DelayCompensated
+from agents.delay_kernels import FOOT
+from agents.nmpc import closed_loop_kernels as loops
 from agents.nmpc.layout import working_space
-from agents.nmpc.program import INNER
 from agents.nmpc.rti_agent import RtiMemory, RtiNmpc
+from agents.nmpc.switching import rules_of
+from agents.reference import NODE
+from lpv_track_env import filtering
 from lpv_track_env import kernels as k
 from lpv_track_env.threads import checked_threads, shares, using_threads
 from lpv_track_env.vector_env import PathTrackingVectorEnv
-from trajectories.compilation import compiled, compiled_parallel
+from trajectories import CurvatureBands
 
 Array = NDArray[Any]
-
-(
-    STEPS, REWARD, LATERAL, HEADING, SPEED, STEERING_RATE, JERK, MAX_LATERAL, MAX_HEADING,
-    STEERING_VARIATION, FAILED, CLIPPED, ITERATIONS,
-) = range(13)  # fmt: skip
-TALLY = 13
 
 
 class Tally(NamedTuple):
@@ -60,82 +59,7 @@ class Tally(NamedTuple):
     """Periods in which an actuator clipped its command."""
     iterations: Array
     """Interior-point iterations."""
-
-
-@compiled
-def drive_rows(
-    first: int, last: int, periods: int, memories: Array, observations: Array, ends: Array,
-    cases: Array, env_constants: Array, tables: Array, rows: Array, weights: Array,
-    constants: Array, plans: Array, flags: Array, told: Array, states: Array, actions: Array,
-    progress: Array, given: Array, tally: Array, trace: Array, seen: Array, stages: Array,
-    lanes: Array,
-) -> None:  # fmt: skip
-    """Drive environments first to last - 1 until `progress` (n,) reaches `periods` or they end.
-
-    One whose solve fails stays where it is; with `given` (n,) set it goes on with its row of
-    `actions` in place of that solve. `trace` (n, periods or 0, MEMORY_SIZE) gets every memory.
-    `seen` (1, size), `stages` and `lanes` are working space.
-    """
-    for row in range(first, last):
-        memory, case = memories[row], cases[row]
-        table = tables[rows[case, 0] : rows[case, 1]]
-        period = env_constants[case, k.PERIOD]
-        sums = tally[row]
-        while progress[row] < periods and ends[row] == k.RUNNING:
-            if given[row]:
-                given[row] = False
-            else:
-                for j in range(seen.shape[1]):
-                    seen[0, j] = observations[row, j]
-                failed = rti.control(
-                    row, seen, weights, constants, plans, flags, told, states, actions, stages,
-                    lanes,
-                )  # fmt: skip
-                sums[ITERATIONS] += told[row, INNER]
-                if failed > 0:
-                    sums[FAILED] += 1.0
-                    break
-            before_a, before_delta = memory[k.ACCELERATION], memory[k.STEERING]
-            ends[row] = k.drive(
-                memory, actions[row, 0], actions[row, 1], env_constants[case], table,
-                observations[row],
-            )  # fmt: skip
-            if trace.shape[1] > 0:
-                for j in range(memory.shape[0]):
-                    trace[row, progress[row], j] = memory[j]
-            progress[row] += 1
-            change_a = memory[k.ACCELERATION] - before_a
-            change_delta = memory[k.STEERING] - before_delta
-            sums[STEPS] += 1.0
-            sums[REWARD] += memory[k.REWARD]
-            sums[LATERAL] += memory[k.LATERAL_ERROR] * memory[k.LATERAL_ERROR]
-            sums[HEADING] += memory[k.HEADING_ERROR] * memory[k.HEADING_ERROR]
-            sums[SPEED] += memory[k.SPEED_ERROR] * memory[k.SPEED_ERROR]
-            sums[STEERING_RATE] += change_delta * change_delta / (period * period)
-            sums[JERK] += change_a * change_a / (period * period)
-            sums[MAX_LATERAL] = max(sums[MAX_LATERAL], abs(memory[k.LATERAL_ERROR]))
-            sums[MAX_HEADING] = max(sums[MAX_HEADING], abs(memory[k.HEADING_ERROR]))
-            sums[STEERING_VARIATION] += abs(change_delta)
-            if memory[k.CLIPPED] > 0.0:
-                sums[CLIPPED] += 1.0
-
-
-@compiled_parallel
-def drive_in_threads(
-    chunks: int, n: int, periods: int, memories: Array, observations: Array, ends: Array,
-    cases: Array, env_constants: Array, tables: Array, rows: Array, weights: Array,
-    constants: Array, plans: Array, flags: Array, told: Array, states: Array, actions: Array,
-    progress: Array, given: Array, tally: Array, trace: Array, seen: Array, stages: Array,
-    lanes: Array,
-) -> None:  # fmt: skip
-    """`drive_rows` on all n, in chunks that threads share; each has its own working space."""
-    for chunk in numba.prange(chunks):
-        drive_rows(
-            chunk * n // chunks, (chunk + 1) * n // chunks, periods, memories, observations, ends,
-            cases, env_constants, tables, rows, weights, constants, plans, flags, told,
-            states, actions, progress, given, tally, trace, seen[chunk], stages[chunk],
-            lanes[chunk],
-        )  # fmt: skip
+    solves: Array
 
 
 class ClosedLoop:
@@ -147,8 +71,11 @@ class ClosedLoop:
         The environments, autoreset mode DISABLED: one that has ended stands still until
         `reset(options={"reset_mask": mask})`. Paths, vehicles and randomisation are theirs.
     agent
-        The NMPC, made for such an environment: its problem, settings, and its weights where
-        `drive` is given none.
+        `lpv-nmpc`, made for such an environment: its problem, settings, delay compensation, and its
+        weights or schedule where `drive` is given none.
+    bands, slew
+        Of weights that `drive` is given: bands of curvature with a set each, and the largest change
+        of a weight's logarithm, 1/s. By default one set for all, and no limit.
     threads
         Threads of a call, 1 by default. Results do not depend on it.
 
@@ -165,27 +92,44 @@ class ClosedLoop:
     >>> tally = loop.drive(20, weights)  # (64, 10), a set for each
     """
 
-    def __init__(self, envs: PathTrackingVectorEnv, agent: RtiNmpc, *, threads: int = 1) -> None:
+    def __init__(
+        self,
+        envs: PathTrackingVectorEnv,
+        agent: RtiNmpc | DelayCompensated,
+        *,
+        bands: CurvatureBands | None = None,
+        slew: float = math.inf,
+        threads: int = 1,
+    ) -> None:
         if envs.autoreset_mode is not AutoresetMode.DISABLED:
             raise ValueError("a closed loop needs environments with autoreset_mode='Disabled'")
-        if envs.single.conditions is not None:
-            raise ValueError(
-                "a closed loop in compiled code knows conditions 'simulation' only: step the "
-                "environments and let the agent predict"
-            )
         if envs.single.layout != agent.task.layout:
             raise ValueError(
                 f"the agent is made for {agent.task.layout}, the environments have "
                 f"{envs.single.layout}: make it with agents.make(name, envs.single)"
             )
-        self.envs, self.agent = envs, agent
-        n = envs.num_envs
-        self.memory = RtiMemory(n, agent.problem.horizon)
+        self.envs = envs
+        future = agent.future if isinstance(agent, DelayCompensated) else None
+        inner = agent.agent if isinstance(agent, DelayCompensated) else agent
+        if not isinstance(inner, RtiNmpc):
+            raise TypeError(f"a closed loop drives with lpv-nmpc, not with {type(inner).__name__}")
+        self.agent: RtiNmpc = inner
+        n, horizon = envs.num_envs, inner.problem.horizon
+        self.bands = CurvatureBands((), ("all",)) if bands is None else bands
+        self._rules = rules_of(self.bands, 0.0, slew, envs.single.control_period)
+        self.memory = RtiMemory(n, horizon)
         self._threads = min(checked_threads(threads), n)
+        self._looked = np.zeros((n, inner.task.layout.size))
+        self._delayed = future is not None
+        self._commands = np.zeros((n, future.kept if future is not None else 1, 2))
+        self._feet = np.zeros((n, FOOT))
+        self._future = future.settings if future is not None else np.zeros(0)
+        many = shares(self._threads)
         self._work = (
-            np.zeros((shares(self._threads), 1, agent.task.layout.size)),
-            *working_space(agent.problem.horizon, shares(self._threads)),
+            np.zeros((many, inner.task.layout.preview_steps + 1, NODE)),
+            *working_space(horizon, many),
         )
+        self._filter_work = np.zeros((many, filtering.WORK))
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -195,6 +139,8 @@ class ClosedLoop:
         mask = (options or {}).get("reset_mask", np.ones(self.envs.num_envs, dtype=np.bool_))
         for row in np.flatnonzero(mask).tolist():
             self.memory.clear(row)
+            # Before the first command the actuators have stood where they are.
+            self._commands[row] = np.nan_to_num(result[0][row, 3:5])
         return result
 
     @property
@@ -204,7 +150,12 @@ class ClosedLoop:
         return running
 
     def drive(
-        self, periods: int, weights: ArrayLike | None = None, *, trace: Array | None = None
+        self,
+        periods: int,
+        weights: ArrayLike | None = None,
+        *,
+        until_band: bool = False,
+        trace: Array | None = None,
     ) -> Tally:
         """Drive every running environment `periods` control periods, or to its episode's end.
 
@@ -213,8 +164,12 @@ class ClosedLoop:
         periods
             At least 1.
         weights
-            Q, S, R, (10,) for all or (n, 10); by default the agent's own. Rows that are not finite
-            or negative are refused.
+            Q, S, R: (10,) for all, (n, 10), or (n, bands, 10) where the loop has bands; by default
+            the agent's own, its schedule's too. Rows that are not finite or negative are refused,
+            others brought within the bounds of weights.
+        until_band
+            Whether an environment stops before the first solve in which its band is another, so
+            that it may be given other weights.
         trace
             Filled if given, (n, periods, `kernels.MEMORY_SIZE`): each environment's memory after
             each period that it drove.
@@ -230,7 +185,7 @@ class ClosedLoop:
             raise ValueError(f"periods must be at least 1, not {periods}")
         if not self.envs.begun:
             raise gymnasium.error.ResetNeeded("the episodes have not begun: call reset() first")
-        sets = self._checked_weights(weights)
+        sets, rules = self._checked_weights(weights)
         if trace is None:
             trace = np.empty((n, 0, k.MEMORY_SIZE))
         elif (
@@ -242,41 +197,75 @@ class ClosedLoop:
                 f"trace must be a writable C-ordered float64 array "
                 f"{(n, periods, k.MEMORY_SIZE)}, not {trace.dtype} {trace.shape}"
             )
-        progress, given = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.bool_)
-        tally = np.zeros((n, TALLY))
+        progress, asked = np.zeros(n, dtype=np.int64), np.full(n, loops.ASKED)
+        tally = np.zeros((n, loops.TALLY))
         memory, arrays = self.memory, self.envs.arrays
         arguments = (
-            periods, *arrays, sets, self.agent.solver.constants, memory.plans, memory.flags,
-            memory.told, memory.states, memory.actions, progress, given,
-            tally, trace,
+            periods, *arrays, self._looked, self._commands, self._feet, self._future, sets, rules,
+            memory.bands, memory.weights, until_band, self.agent.solver.constants, memory.plans,
+            memory.flags, memory.told, memory.states, memory.actions, progress, asked, tally,
+            trace,
         )  # fmt: skip
         while True:
-            if self._threads == 1:
-                drive_rows(0, n, *arguments, *(space[0] for space in self._work))
-            else:
-                with using_threads(self._threads):
-                    drive_in_threads(min(len(self._work[0]), n), n, *arguments, *self._work)
-            stuck = np.flatnonzero((arrays.ends == k.RUNNING) & (progress < periods))
+            self._call(arguments)
+            stuck = np.flatnonzero(asked == loops.HELD)
             if stuck.size == 0:
                 return Tally(*tally.T.copy())
-            self.agent.replace_failed(arrays.observations.astype(np.float64), memory, stuck)
-            given[stuck] = True
+            self.agent.replace_failed(self._looked, memory, stuck)
+            asked[stuck] = loops.GIVEN
 
-    def _checked_weights(self, weights: ArrayLike | None) -> Array:
+    def _call(self, arguments: tuple[Any, ...]) -> None:
+        """Drive all that are not HELD or PAUSED, in threads if the loop has them."""
+        n, given = self.envs.num_envs, self.envs.condition_arrays
+        work = (*self._work, *(() if given is None else (self._filter_work,)))
+        kernel: Any = loops.drive_rows if given is None else loops.drive_rows_under_conditions
+        more = given or ()
+        spaces = len(self._work)
+        if self._threads == 1:
+            own = [space[0] for space in work]
+            kernel(0, n, *arguments, *own[:spaces], *more, *own[spaces:])
+            return
+        many: Any = (
+            loops.drive_in_threads if given is None else loops.drive_in_threads_under_conditions
+        )
+        chunks = min(len(self._work[0]), n)
+        with using_threads(self._threads):
+            many(chunks, n, *arguments, *work[:spaces], *more, *work[spaces:])
+
+    def copy(self, source: ArrayLike, target: ArrayLike) -> None:
+        """Make environments `target` those that `source` are, in every respect: both (m,) indices.
+
+        What they drive from there on is the same, disturbances included, under the same weights.
+        """
+        rows, onto = np.asarray(source, dtype=np.intp), np.asarray(target, dtype=np.intp)
+        memory = self.memory
+        self.envs.copy(rows, onto)
+        for array in (
+            memory.plans, memory.flags, memory.told, memory.states, memory.actions, memory.bands,
+            memory.weights, self._looked, self._commands, self._feet,
+        ):  # fmt: skip
+            array[onto] = array[rows]
+        for row, other in zip(rows.tolist(), onto.tolist(), strict=True):
+            memory.ladders.pop(other, None)
+            if row in memory.ladders:
+                memory.ladders[other] = copy.deepcopy(memory.ladders[row])
+
+    def _checked_weights(self, weights: ArrayLike | None) -> tuple[Array, Array]:
+        """Tables (1 or n, bands, 10) and the rules by which a band is chosen."""
         if weights is None:
-            if self.agent.has_schedule:
-                raise ValueError(
-                    "the agent's weights come from a schedule, which predict follows: give drive "
-                    "its weights"
-                )
-            return self.agent.fixed_weights
-        values = np.atleast_2d(np.asarray(weights, dtype=np.float64))
-        n = self.envs.num_envs
-        if values.shape not in {(1, 10), (n, 10)}:
-            raise ValueError(f"weights must be (10,) or ({n}, 10), not {np.shape(weights)}")
-        bad = ~(np.isfinite(values) & (values >= 0.0)).all(axis=1)
+            return self.agent.switching.tables, self.agent.switching.rules
+        values = np.asarray(weights, dtype=np.float64)
+        n, count = self.envs.num_envs, len(self.bands)
+        if values.ndim < 3:
+            values = np.atleast_2d(values)
+        if values.shape in {(1, 10), (n, 10)}:
+            values = np.repeat(values[:, None], count, axis=1)
+        if values.shape not in {(1, count, 10), (n, count, 10)}:
+            tables = f" or ({n}, {count}, 10)" if count > 1 else ""
+            raise ValueError(f"weights must be (10,) or ({n}, 10){tables}, not {np.shape(weights)}")
+        bad = ~(np.isfinite(values) & (values >= 0.0)).all(axis=(1, 2))
         if bad.any():
             row = int(np.argmax(bad))
             raise ValueError(f"weights of environment {row} must be finite and >= 0: {values[row]}")
         # A copy: one compiled form takes it, whatever array it came in.
-        return np.array(values, order="C")
+        return np.array(values, order="C"), self._rules

@@ -13,6 +13,7 @@ from agents.nmpc import layout, program, rti
 from agents.nmpc.base import Ladder, NmpcAgent
 from agents.nmpc.problem import INPUTS, STATES
 from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
+from agents.nmpc.switching import NO_BAND, WEIGHTS
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.threads import checked_threads, shares, using_threads
@@ -25,7 +26,8 @@ class RtiMemory:
     """What the real-time NMPC remembers of n vehicles: arrays for compiled code, a row a vehicle.
 
     `plans` (n, N, 2), `flags` (n, FLAGS), `told` (n, TOLD), `states` (n, N + 1, 6) as `rti` has
-    them; `actions` (n, 2) of the last step.
+    them; `actions` (n, 2) of the last step; `bands` (n,) and `weights` (n, 10) in use where a
+    schedule chooses, as `switching` has them.
     """
 
     def __init__(self, rows: int, horizon: int) -> None:
@@ -34,7 +36,8 @@ class RtiMemory:
         self.told = np.zeros((rows, program.TOLD))
         self.states = np.zeros((rows, horizon + 1, STATES))
         self.actions = np.zeros((rows, INPUTS))
-        self.bands: list[int | None] = [None] * rows
+        self.bands = np.full(rows, NO_BAND)
+        self.weights = np.zeros((rows, WEIGHTS))
         self.ladders: dict[int, Ladder] = {}
         """Of rows in which a solve has failed in this episode."""
         self.seconds = 0.0
@@ -51,15 +54,13 @@ class RtiMemory:
     def take(self, row: int) -> "RtiMemory":
         """Memory of one row alone, on the same arrays; `put` gives the rest of it back."""
         alone = copy.copy(self)
-        for name in ("plans", "flags", "told", "states", "actions"):
+        for name in ("plans", "flags", "told", "states", "actions", "bands", "weights"):
             setattr(alone, name, getattr(self, name)[row : row + 1])
-        alone.bands = [self.bands[row]]
         alone.ladders = {0: self.ladders[row]} if row in self.ladders else {}
         return alone
 
     def put(self, row: int, alone: "RtiMemory") -> None:
         """Take back a row that was given out by `take`."""
-        self.bands[row] = alone.bands[0]
         if 0 in alone.ladders:
             self.ladders[row] = alone.ladders[0]
         self.seconds = alone.seconds * len(self)
@@ -67,7 +68,8 @@ class RtiMemory:
     def clear(self, row: int) -> None:
         """Forget a row: a new episode begins there."""
         self.flags[row] = 0
-        self.bands[row] = None
+        self.bands[row] = NO_BAND
+        self.weights[row] = 0.0
         self.ladders.pop(row, None)
 
 
@@ -148,11 +150,9 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         self._memory: RtiMemory | None = None
         self._size = task.layout.size
         # Of no rows: so it compiles here, if need be, and not within the first control period.
-        self._control(np.zeros((0, self._size)), self._rows, self._new(0))
-
-    @property
-    def _rows(self) -> Array:
-        return self._weights.reshape(1, -1)
+        memory, none = self._new(0), np.zeros((0, self._size))
+        self.switching.choose(none, self.problem.horizon, memory.bands, memory.weights)
+        self._control(none, self.fixed_weights, memory)
 
     def control(self, observation: TrackingObservation, memory: RtiRow) -> tuple[float, float]:
         """Inputs for one observation, those of `predict`; what it remembers is that row's."""
@@ -197,7 +197,11 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         if episode_start is not None and np.asarray(episode_start).any():
             for row in np.flatnonzero(np.broadcast_to(episode_start, (n,))).tolist():
                 memory.clear(row)
-        weights = self._rows if self._schedule is None else self._weights_of(rows, memory)
+        if self.has_schedule:
+            self.switching.choose(rows, self.problem.horizon, memory.bands, memory.weights)
+            weights = memory.weights
+        else:
+            weights = self.fixed_weights
         began = time.perf_counter()
         failed = self._control(rows, weights, memory)
         memory.seconds = time.perf_counter() - began
@@ -222,29 +226,6 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         with using_threads(self._threads):
             rti.control_in_threads(chunks, *arguments, stages, lanes, failed)
         return int(failed.sum())
-
-    def _weights_of(self, rows: Array, memory: RtiMemory) -> Array:
-        """Weights that the schedule chooses for each row, (n, 10)."""
-        assert self._schedule is not None
-        weights = np.empty((len(rows), self._weights.size))
-        curvature = self.task.layout.unpack(rows).preview_curvature[:, : self.problem.horizon]
-        for row, preview in enumerate(curvature):
-            if np.isfinite(preview).all():
-                chosen, memory.bands[row] = self._schedule.select(preview, memory.bands[row])
-                weights[row] = chosen.clipped().as_array()
-            else:
-                weights[row] = self._weights
-        return weights
-
-    @property
-    def has_schedule(self) -> bool:
-        """Whether weights are chosen by curvature at every step."""
-        return self._schedule is not None
-
-    @property
-    def fixed_weights(self) -> Array:
-        """Q, S, R in use where no schedule chooses, (1, 10)."""
-        return self._rows
 
     def replace_failed(self, rows: Array, memory: RtiMemory, failed: NDArray[np.intp]) -> None:
         """Put what the ladder says in place of the actions of `failed` rows' solves."""

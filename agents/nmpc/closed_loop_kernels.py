@@ -1,0 +1,223 @@
+"""Compiled kernels of closed loops: control periods of many vehicles, each with its NMPC."""
+
+import math
+from typing import Any
+
+import numba
+from numpy.typing import NDArray
+
+from agents.delay_kernels import look_ahead
+from agents.nmpc import rti
+from agents.nmpc.program import INNER
+from agents.nmpc.switching import NO_BAND, band_of, choose_weights, sharpest
+from lpv_track_env import conditions_layout
+from lpv_track_env import kernels as k
+from lpv_track_env.conditions_episode import drive_under_conditions
+from lpv_track_env.vector_kernels import copy
+from trajectories.compilation import compiled, compiled_internal, compiled_parallel
+
+Array = NDArray[Any]
+
+(
+    STEPS, REWARD, LATERAL, HEADING, SPEED, STEERING_RATE, JERK, MAX_LATERAL, MAX_HEADING,
+    STEERING_VARIATION, FAILED, CLIPPED, ITERATIONS, SOLVES,
+) = range(14)  # fmt: skip
+TALLY = 14
+
+ASKED, GIVEN, HELD, PAUSED = range(4)
+"""What holds for a vehicle's next action: its NMPC is asked, `actions` has what replaces a failed
+solve, the vehicle is not to go on in this call."""
+
+
+@compiled_internal
+def count(memory: Array, before_a: Any, before_delta: Any, period: Any, sums: Array) -> None:
+    """Add a period that was driven to its vehicle's tally, (TALLY,)."""
+    change_a = memory[k.ACCELERATION] - before_a
+    change_delta = memory[k.STEERING] - before_delta
+    sums[STEPS] += 1.0
+    sums[REWARD] += memory[k.REWARD]
+    sums[LATERAL] += memory[k.LATERAL_ERROR] * memory[k.LATERAL_ERROR]
+    sums[HEADING] += memory[k.HEADING_ERROR] * memory[k.HEADING_ERROR]
+    sums[SPEED] += memory[k.SPEED_ERROR] * memory[k.SPEED_ERROR]
+    sums[STEERING_RATE] += change_delta * change_delta / (period * period)
+    sums[JERK] += change_a * change_a / (period * period)
+    sums[MAX_LATERAL] = max(sums[MAX_LATERAL], abs(memory[k.LATERAL_ERROR]))
+    sums[MAX_HEADING] = max(sums[MAX_HEADING], abs(memory[k.HEADING_ERROR]))
+    sums[STEERING_VARIATION] += abs(change_delta)
+    if memory[k.CLIPPED] > 0.0:
+        sums[CLIPPED] += 1.0
+
+
+@compiled_internal
+def look(
+    observation: Array, commands: Array, foot: Array, future: Array, nodes: Array, seen: Array
+) -> None:
+    """Fill `seen` (size,) with what the NMPC is shown: with `future` settings, when it lands."""
+    total = 0.0
+    for j in range(seen.shape[0]):
+        seen[j] = observation[j]
+        total += abs(seen[j])
+    if future.shape[0] > 0:
+        foot[0] = foot[1] = foot[2] = 0.0
+        if math.isfinite(total):
+            look_ahead(seen, commands, future, nodes, foot)
+
+
+@compiled_internal
+def remember(commands: Array, a: Any, delta: Any) -> None:
+    """Put a command before those that were sent earlier, (rows, 2)."""
+    for j in range(commands.shape[0] - 1, 0, -1):
+        commands[j, 0], commands[j, 1] = commands[j - 1, 0], commands[j - 1, 1]
+    commands[0, 0], commands[0, 1] = a, delta
+
+
+@compiled
+def decide(
+    row: int, asked: int, observations: Array, looked: Array, commands: Array, feet: Array,
+    future: Array, nodes: Array, tables: Array, rules: Array, bands: Array, weights: Array,
+    until_band: bool, constants: Array, plans: Array, flags: Array, told: Array, states: Array,
+    actions: Array, sums: Array, stages: Array, lanes: Array,
+) -> int:  # fmt: skip
+    """Fill a vehicle's row of `actions`; HELD if its solve has failed, PAUSED at a band's end."""
+    if asked == ASKED:
+        look(observations[row], commands[row], feet[row], future, nodes, looked[row])
+        if until_band and bands[row] != NO_BAND:
+            curvature = sharpest(looked[row], lanes.shape[1])
+            if (
+                math.isfinite(curvature) and sums[STEPS] > 0.0
+                and band_of(curvature, bands[row], rules) != bands[row]
+            ):  # fmt: skip
+                return PAUSED
+        own = row if tables.shape[0] > 1 else 0
+        choose_weights(looked[row], lanes.shape[1], tables[own], rules, bands, row, weights[row])
+        failed = rti.control(
+            row, looked[row : row + 1], weights[row : row + 1], constants, plans, flags, told,
+            states, actions, stages, lanes,
+        )  # fmt: skip
+        sums[ITERATIONS] += told[row, INNER]
+        sums[SOLVES] += 1.0
+        if failed > 0:
+            sums[FAILED] += 1.0
+            return HELD
+    if future.shape[0] > 0:
+        remember(commands[row], actions[row, 0], actions[row, 1])
+    return ASKED
+
+
+@compiled
+def drive_rows(
+    first: int, last: int, periods: int, memories: Array, observations: Array, ends: Array,
+    cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
+    feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
+    until_band: bool, constants: Array, plans: Array, flags: Array, told: Array, states: Array,
+    actions: Array, progress: Array, asked: Array, tally: Array, trace: Array, nodes: Array,
+    stages: Array, lanes: Array,
+) -> None:  # fmt: skip
+    """Drive vehicles first to last - 1 until `progress` (n,) reaches `periods` or they end.
+
+    One whose solve fails stays where it is, `asked` (n,) HELD; set to GIVEN it goes on with its row
+    of `actions` in place of that solve. With `until_band` one waits, PAUSED, where the preview's
+    band changes. `trace` (n, periods or 0, MEMORY_SIZE) gets every memory. `nodes`, `stages` and
+    `lanes` are working space.
+    """
+    for row in range(first, last):
+        if asked[row] == HELD or asked[row] == PAUSED:
+            continue
+        memory, case = memories[row], cases[row]
+        table = tables[rows[case, 0] : rows[case, 1]]
+        while progress[row] < periods and ends[row] == k.RUNNING:
+            asked[row] = decide(
+                row, asked[row], observations, looked, commands, feet, future, nodes,
+                weight_tables, rules, bands, weights, until_band, constants, plans, flags, told,
+                states, actions, tally[row], stages, lanes,
+            )  # fmt: skip
+            if asked[row] != ASKED:
+                break
+            before_a, before_delta = memory[k.ACCELERATION], memory[k.STEERING]
+            ends[row] = k.drive(
+                memory, actions[row, 0], actions[row, 1], env_constants[case], table,
+                observations[row],
+            )  # fmt: skip
+            if trace.shape[1] > 0:
+                copy(memory, trace[row, progress[row]])
+            progress[row] += 1
+            count(memory, before_a, before_delta, env_constants[case, k.PERIOD], tally[row])
+
+
+@compiled
+def drive_rows_under_conditions(
+    first: int, last: int, periods: int, memories: Array, observations: Array, ends: Array,
+    cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
+    feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
+    until_band: bool, constants: Array, plans: Array, flags: Array, told: Array, states: Array,
+    actions: Array, progress: Array, asked: Array, tally: Array, trace: Array, nodes: Array,
+    stages: Array, lanes: Array, vehicles: Array, specs: Array, draws: Array, work: Array,
+) -> None:  # fmt: skip
+    """`drive_rows` under conditions, see `conditions_vector.advance` for the last four arrays."""
+    for row in range(first, last):
+        if asked[row] == HELD or asked[row] == PAUSED:
+            continue
+        memory, case = memories[row], cases[row]
+        table = tables[rows[case, 0] : rows[case, 1]]
+        period = env_constants[case, k.PERIOD]
+        while progress[row] < periods and ends[row] == k.RUNNING:
+            free_at = vehicles[row, conditions_layout.FREE_AT]
+            if free_at > memory[k.STEPS] * period + conditions_layout.INSTANT:
+                # Busy with an earlier command: nothing is computed, the last one stays.
+                remember(commands[row], commands[row, 0, 0], commands[row, 0, 1])
+            else:
+                asked[row] = decide(
+                    row, asked[row], observations, looked, commands, feet, future, nodes,
+                    weight_tables, rules, bands, weights, until_band, constants, plans, flags,
+                    told, states, actions, tally[row], stages, lanes,
+                )  # fmt: skip
+                if asked[row] != ASKED:
+                    break
+            before_a, before_delta = memory[k.ACCELERATION], memory[k.STEERING]
+            ends[row] = drive_under_conditions(
+                vehicles[row], memory, actions[row, 0], actions[row, 1], specs[case],
+                env_constants[case], table, observations[row], draws[row, 0], draws[row, 1], work,
+            )  # fmt: skip
+            if trace.shape[1] > 0:
+                copy(memory, trace[row, progress[row]])
+            progress[row] += 1
+            count(memory, before_a, before_delta, period, tally[row])
+
+
+@compiled_parallel
+def drive_in_threads(
+    chunks: int, n: int, periods: int, memories: Array, observations: Array, ends: Array,
+    cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
+    feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
+    until_band: bool, constants: Array, plans: Array, flags: Array, told: Array, states: Array,
+    actions: Array, progress: Array, asked: Array, tally: Array, trace: Array, nodes: Array,
+    stages: Array, lanes: Array,
+) -> None:  # fmt: skip
+    """`drive_rows` on all n, in chunks that threads share; each has its own working space."""
+    for chunk in numba.prange(chunks):
+        drive_rows(
+            chunk * n // chunks, (chunk + 1) * n // chunks, periods, memories, observations, ends,
+            cases, env_constants, tables, rows, looked, commands, feet, future, weight_tables,
+            rules, bands, weights, until_band, constants, plans, flags, told, states, actions,
+            progress, asked, tally, trace, nodes[chunk], stages[chunk], lanes[chunk],
+        )  # fmt: skip
+
+
+@compiled_parallel
+def drive_in_threads_under_conditions(
+    chunks: int, n: int, periods: int, memories: Array, observations: Array, ends: Array,
+    cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
+    feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
+    until_band: bool, constants: Array, plans: Array, flags: Array, told: Array, states: Array,
+    actions: Array, progress: Array, asked: Array, tally: Array, trace: Array, nodes: Array,
+    stages: Array, lanes: Array, vehicles: Array, specs: Array, draws: Array, work: Array,
+) -> None:  # fmt: skip
+    """`drive_in_threads` under conditions."""
+    for chunk in numba.prange(chunks):
+        drive_rows_under_conditions(
+            chunk * n // chunks, (chunk + 1) * n // chunks, periods, memories, observations, ends,
+            cases, env_constants, tables, rows, looked, commands, feet, future, weight_tables,
+            rules, bands, weights, until_band, constants, plans, flags, told, states, actions,
+            progress, asked, tally, trace, nodes[chunk], stages[chunk], lanes[chunk], vehicles,
+            specs, draws, work[chunk],
+        )  # fmt: skip
