@@ -63,6 +63,7 @@ class InTurns:
             self.agents.append(agent)
         self.failures, self.iterations = np.zeros(n), np.zeros(n)
         self.fallbacks: list[str] = [""] * n
+        self.actions = np.zeros((n, 1, 2), dtype=np.float32)
 
     def reset(self, rows: Any = None, *, seed: int | None = None, **options: Any) -> None:
         for i in range(len(self.envs)) if rows is None else rows:
@@ -81,11 +82,12 @@ class InTurns:
                 else:
                     # A copy: tests put what they like in place of what is seen.
                     actions, memory = agent.predict(env.arrays.observations.copy())
+                    self.actions[i] = actions
                     told = agent.diagnostics(memory[0])
                     self.failures[i] += told["status"] != "SUCCESS"
                     self.iterations[i] += told["iterations"]
                     self.fallbacks[i] = told["fallback"]
-                env.step(actions)
+                env.step(self.actions[i])
                 trace[i, period] = env.memories[0]
         return trace
 

@@ -21,6 +21,7 @@ import agents
 from agents.nmpc.closed_loop import ClosedLoop, Tally
 from agents.nmpc.closed_loop_kernels import drive_rows
 from agents.nmpc.rti_agent import RtiMemory
+from agents.nmpc.switching import NO_BAND
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env import conditions_layout as layout
 from lpv_track_env import kernels as k
@@ -256,15 +257,15 @@ def test_until_band_stops_where_the_band_changes() -> None:
     while (driven < 60).any():
         before = stopping.memory.bands.copy()
         tally, piece = traced(stopping, 60, WEIGHTS, until_band=True)
-        steps = tally.steps.astype(np.int64)
+        steps, after = tally.steps.astype(np.int64), stopping.memory.bands
         assert steps.min() >= 1
         for row in range(5):
-            count = min(steps[row], 60 - driven[row])
+            count = max(min(steps[row], 60 - driven[row]), 0)
             np.testing.assert_array_equal(
                 piece[row, :count], trace[row, driven[row] : driven[row] + count]
             )
-            # Bands last: it has not changed within the piece, and has after all but the last.
-            assert steps[row] == 60 or stops == 0 or before[row] != stopping.memory.bands[row]
+            # It stopped for another band, in which it will be.
+            assert steps[row] == 60 or before[row] == NO_BAND or before[row] != after[row]
         driven += steps
         stops += 1
     assert stops > 1
@@ -284,7 +285,9 @@ def test_copies_drive_as_their_originals() -> None:
         np.testing.assert_array_equal(trace[image], trace[original])
         assert [values[image] for values in tally] == [values[original] for values in tally]
     loop.copy([0], [2])
-    _, trace = traced(loop, 10, np.array([WEIGHTS, WEIGHTS, 2.0 * WEIGHTS, *weights[3:]]))
+    _, trace = traced(
+        loop, 10, np.array([WEIGHTS, WEIGHTS, 3.0 ** np.arange(10) * WEIGHTS, *weights[3:]])
+    )
     assert not np.array_equal(trace[2], trace[0])
 
 

@@ -169,7 +169,7 @@ class ClosedLoop:
             others brought within the bounds of weights.
         until_band
             Whether an environment stops before the first solve in which its band is another, so
-            that it may be given other weights.
+            that it may be given other weights; `memory.bands` are those of the next period then.
         trace
             Filled if given, (n, periods, `kernels.MEMORY_SIZE`): each environment's memory after
             each period that it drove.

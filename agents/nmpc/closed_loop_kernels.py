@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from agents.delay_kernels import look_ahead
 from agents.nmpc import rti
 from agents.nmpc.program import INNER
-from agents.nmpc.switching import NO_BAND, band_of, choose_weights, sharpest
+from agents.nmpc.switching import NO_BAND, choose_weights, update_band
 from lpv_track_env import conditions_layout
 from lpv_track_env import kernels as k
 from lpv_track_env.conditions_episode import drive_under_conditions
@@ -81,12 +81,10 @@ def decide(
     """Fill a vehicle's row of `actions`; HELD if its solve has failed, PAUSED at a band's end."""
     if asked == ASKED:
         look(observations[row], commands[row], feet[row], future, nodes, looked[row])
-        if until_band and bands[row] != NO_BAND:
-            curvature = sharpest(looked[row], lanes.shape[1])
-            if (
-                math.isfinite(curvature) and sums[STEPS] > 0.0
-                and band_of(curvature, bands[row], rules) != bands[row]
-            ):  # fmt: skip
+        if until_band:
+            before = bands[row]
+            update_band(looked[row], lanes.shape[1], rules, bands, row)
+            if before not in (NO_BAND, bands[row]):
                 return PAUSED
         own = row if tables.shape[0] > 1 else 0
         choose_weights(looked[row], lanes.shape[1], tables[own], rules, bands, row, weights[row])
@@ -117,8 +115,8 @@ def drive_rows(
 
     One whose solve fails stays where it is, `asked` (n,) HELD; set to GIVEN it goes on with its row
     of `actions` in place of that solve. With `until_band` one waits, PAUSED, where the preview's
-    band changes. `trace` (n, periods or 0, MEMORY_SIZE) gets every memory. `nodes`, `stages` and
-    `lanes` are working space.
+    band changes, and in the end `bands` are those of the next period. `trace` (n, periods or 0,
+    MEMORY_SIZE) gets every memory. `nodes`, `stages` and `lanes` are working space.
     """
     for row in range(first, last):
         if asked[row] == HELD or asked[row] == PAUSED:
@@ -142,6 +140,9 @@ def drive_rows(
                 copy(memory, trace[row, progress[row]])
             progress[row] += 1
             count(memory, before_a, before_delta, env_constants[case, k.PERIOD], tally[row])
+        if until_band and asked[row] == ASKED and ends[row] == k.RUNNING:
+            look(observations[row], commands[row], feet[row], future, nodes, looked[row])
+            update_band(looked[row], lanes.shape[1], rules, bands, row)
 
 
 @compiled
@@ -182,6 +183,9 @@ def drive_rows_under_conditions(
                 copy(memory, trace[row, progress[row]])
             progress[row] += 1
             count(memory, before_a, before_delta, period, tally[row])
+        if until_band and asked[row] == ASKED and ends[row] == k.RUNNING:
+            look(observations[row], commands[row], feet[row], future, nodes, looked[row])
+            update_band(looked[row], lanes.shape[1], rules, bands, row)
 
 
 @compiled_parallel

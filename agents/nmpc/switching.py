@@ -77,6 +77,14 @@ def band_of(curvature: Any, current: int, rules: Array) -> int:
 
 
 @compiled_internal
+def update_band(observation: Array, steps: int, rules: Array, bands: Array, row: int) -> None:
+    """Bring `bands[row]` up to date with a preview; one that is not finite changes nothing."""
+    curvature = sharpest(observation, steps)
+    if math.isfinite(curvature):
+        bands[row] = band_of(curvature, bands[row], rules)
+
+
+@compiled_internal
 def choose_weights(
     observation: Array, steps: int, tables: Array, rules: Array, bands: Array, row: int, used: Array
 ) -> None:
