@@ -115,8 +115,10 @@ def test_drive_and_predict_share_one_memory() -> None:
     whole.drive(12)
     mixed.drive(5)
     for _ in range(3):
-        actions, memory = mixed.agent.predict(mixed.envs.arrays.observations.copy(), mixed.memory)
-        assert memory is mixed.memory
+        actions, memory = mixed.agent.predict(
+            mixed.envs.arrays.observations.copy(), mixed.memory.nmpc
+        )
+        assert memory is mixed.memory.nmpc
         mixed.envs.step(actions)
     mixed.drive(4)
     np.testing.assert_array_equal(mixed.envs.memories, whole.envs.memories)
@@ -226,7 +228,7 @@ def test_a_schedule_is_followed_as_predict_does(conditions: str, more: dict[str,
     for _ in range(3):
         np.testing.assert_array_equal(traced(loop, 20)[1], turns.drive(20))
     used = np.concatenate([agent_memory(agent).weights for agent in turns.agents])
-    np.testing.assert_array_equal(loop.memory.weights, used)
+    np.testing.assert_array_equal(loop.memory.nmpc.weights, used)
     assert len(set(used[:, 9])) > 1
 
 
@@ -241,7 +243,7 @@ def test_tables_with_a_set_for_each_band_are_a_schedule() -> None:
         loop.reset(seed=1)
     given = np.tile(table, (3, 1, 1))
     np.testing.assert_array_equal(told.drive(60, given), followed.drive(60))
-    np.testing.assert_array_equal(told.memory.weights, followed.memory.weights)
+    np.testing.assert_array_equal(told.memory.nmpc.weights, followed.memory.nmpc.weights)
 
 
 def test_until_band_stops_where_the_band_changes() -> None:
@@ -255,9 +257,9 @@ def test_until_band_stops_where_the_band_changes() -> None:
     driven = np.zeros(5, dtype=np.int64)
     stops = 0
     while (driven < 60).any():
-        before = stopping.memory.bands.copy()
+        before = stopping.memory.nmpc.bands.copy()
         tally, piece = traced(stopping, 60, WEIGHTS, until_band=True)
-        steps, after = tally.steps.astype(np.int64), stopping.memory.bands
+        steps, after = tally.steps.astype(np.int64), stopping.memory.nmpc.bands
         assert steps.min() >= 1
         for row in range(5):
             count = max(min(steps[row], 60 - driven[row]), 0)
@@ -278,7 +280,7 @@ def test_copies_drive_as_their_originals() -> None:
     loop.envs.arrays.observations[1, 5] = np.nan
     loop.drive(15)
     loop.copy([0, 1, 0], [3, 4, 5])
-    assert loop.memory.ladders[4].counts == loop.memory.ladders[1].counts
+    assert loop.memory.nmpc.ladders[4].counts == loop.memory.nmpc.ladders[1].counts
     weights = weights_of(2)[[0, 1, 0, 0, 1, 0]]
     tally, trace = traced(loop, 30, weights)
     for original, image in ((0, 3), (1, 4), (0, 5)):

@@ -39,7 +39,7 @@ def test_failing_solves_go_down_the_ladder_as_in_predict(entry: int, value: floa
     assert [row[2] for row in seen] == [""] * 4 + ["plan"] * 3 + ["stop"] * 3 + [""] * 2
     for row in (1, 2):
         _, memory = turns.agents[row].predict(turns.envs[row].arrays.observations.copy())
-        assert loop.memory.ladders[row].counts == memory.ladders[0].counts
+        assert loop.memory.nmpc.ladders[row].counts == memory.ladders[0].counts
 
 
 def test_diagnostics_after_a_drive_are_those_of_its_last_period() -> None:
@@ -47,10 +47,10 @@ def test_diagnostics_after_a_drive_are_those_of_its_last_period() -> None:
     loop.reset(seed=9)
     loop.envs.arrays.observations[1, 5] = np.nan
     loop.drive(1)
-    told = [loop.agent.diagnostics(loop.memory[row]) for row in range(2)]
+    told = [loop.agent.diagnostics(loop.memory.nmpc[row]) for row in range(2)]
     assert [(t["status"], t["fallback"]) for t in told] == [("SUCCESS", ""), ("NAN", "stanley")]
     loop.drive(1)
-    told = [loop.agent.diagnostics(loop.memory[row]) for row in range(2)]
+    told = [loop.agent.diagnostics(loop.memory.nmpc[row]) for row in range(2)]
     assert [(t["status"], t["fallback"]) for t in told] == [("SUCCESS", "")] * 2
 
 

@@ -109,14 +109,16 @@ class Policy:
         if half.min() < 0.0:
             raise ValueError(f"half must not be negative, but is {half.tolist()}")
         _check_symmetry(self.symmetric, centre)
-        weight, bias = _layer("feature", self.feature_weight, self.feature_bias, self.inputs)
+        weight, bias = checked_layer("feature", self.feature_weight, self.feature_bias, self.inputs)
         if not 1 <= len(self.layers) <= MOST_LAYERS:
             raise ValueError(f"layers must be 1 to {MOST_LAYERS}, not {len(self.layers)}")
         layers: list[Layer] = []
         for k, pair in enumerate(self.layers):
             if not isinstance(pair, tuple | list) or len(pair) != 2:
                 raise ValueError(f"layers[{k}] must be a weight and a bias")
-            layers.append(_layer(f"layers[{k}]", *pair, len(layers[-1][1] if layers else bias)))
+            layers.append(
+                checked_layer(f"layers[{k}]", *pair, len(layers[-1][1] if layers else bias))
+            )
         if len(layers[-1][1]) != ACTIONS:
             raise ValueError(
                 f"the last layer must have {ACTIONS} outputs, for a and delta, "
@@ -234,7 +236,14 @@ def _action(name: str, value: ArrayLike) -> Array:
     return array
 
 
-def _layer(name: str, weight: ArrayLike, bias: ArrayLike, inputs: int) -> Layer:
+def checked_layer(name: str, weight: ArrayLike, bias: ArrayLike, inputs: int) -> Layer:
+    """Weight (out, inputs) and bias (out,) of a layer, float32.
+
+    Raises
+    ------
+    ValueError
+        If they do not fit, naming the layer.
+    """
     w, b = (
         _array(f"{name} {part}", value, np.float32)
         for part, value in (("weight", weight), ("bias", bias))

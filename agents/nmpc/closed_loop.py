@@ -5,7 +5,6 @@ in each is bit for bit what the agent's `predict` and the environment's `step` w
 turns, under every kind of conditions, whatever n is and however many threads share the work.
 """
 
-import copy
 import math
 import operator
 from typing import Any, NamedTuple
@@ -16,12 +15,13 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from agents.delay import DelayCompensated
-from agents.delay_kernels import FOOT
 from agents.nmpc import closed_loop_kernels as loops
 from agents.nmpc.layout import working_space
-from agents.nmpc.rti_agent import RtiMemory, RtiNmpc
-from agents.nmpc.switching import rules_of
+from agents.nmpc.loop_memory import LoopMemory
+from agents.nmpc.rti_agent import RtiNmpc
+from agents.nmpc.switching import NO_BAND, rules_of
 from agents.reference import NODE
+from agents.weight_tuning.deciding import NOBODY, Decider
 from lpv_track_env import filtering
 from lpv_track_env import kernels as k
 from lpv_track_env.threads import checked_threads, shares, using_threads
@@ -76,6 +76,9 @@ class ClosedLoop:
     bands, slew
         Of weights that `drive` is given: bands of curvature with a set each, and the largest change
         of a weight's logarithm, 1/s. By default one set for all, and no limit.
+    decider
+        A weight policy at work: it chooses the weights where `drive` is given none; bands and slew
+        are its own.
     threads
         Threads of a call, 1 by default. Results do not depend on it.
 
@@ -99,6 +102,7 @@ class ClosedLoop:
         *,
         bands: CurvatureBands | None = None,
         slew: float = math.inf,
+        decider: Decider | None = None,
         threads: int = 1,
     ) -> None:
         if envs.autoreset_mode is not AutoresetMode.DISABLED:
@@ -114,19 +118,22 @@ class ClosedLoop:
         if not isinstance(inner, RtiNmpc):
             raise TypeError(f"a closed loop drives with lpv-nmpc, not with {type(inner).__name__}")
         self.agent: RtiNmpc = inner
-        n, horizon = envs.num_envs, inner.problem.horizon
+        self._decider = decider
+        n, horizon, layout = envs.num_envs, inner.problem.horizon, inner.task.layout
         self.bands = CurvatureBands((), ("all",)) if bands is None else bands
         self._rules = rules_of(self.bands, 0.0, slew, envs.single.control_period)
-        self.memory = RtiMemory(n, horizon)
+        if decider is not None:
+            self.bands, self._rules = decider.choice.bands, decider.rules
+        self.memory = LoopMemory(
+            n, horizon, layout.size, future,
+            np.zeros((1, 10)) if decider is None else decider.packed.sets,
+        )  # fmt: skip
         self._threads = min(checked_threads(threads), n)
-        self._looked = np.zeros((n, inner.task.layout.size))
-        self._delayed = future is not None
-        self._commands = np.zeros((n, future.kept if future is not None else 1, 2))
-        self._feet = np.zeros((n, FOOT))
         self._future = future.settings if future is not None else np.zeros(0)
         many = shares(self._threads)
         self._work = (
-            np.zeros((many, inner.task.layout.preview_steps + 1, NODE)),
+            np.zeros((many, layout.preview_steps + 1, NODE)),
+            np.zeros((many, 2, 1 if decider is None else decider.widest), dtype=np.float32),
             *working_space(horizon, many),
         )
         self._filter_work = np.zeros((many, filtering.WORK))
@@ -138,9 +145,7 @@ class ClosedLoop:
         result = self.envs.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask", np.ones(self.envs.num_envs, dtype=np.bool_))
         for row in np.flatnonzero(mask).tolist():
-            self.memory.clear(row)
-            # Before the first command the actuators have stood where they are.
-            self._commands[row] = np.nan_to_num(result[0][row, 3:5])
+            self.memory.clear(row, result[0][row])
         return result
 
     @property
@@ -169,7 +174,8 @@ class ClosedLoop:
             others brought within the bounds of weights.
         until_band
             Whether an environment stops before the first solve in which its band is another, so
-            that it may be given other weights; `memory.bands` are those of the next period then.
+            that it may be given other weights; `memory.nmpc.bands` and
+            `memory.watched` are those of the next period then.
         trace
             Filled if given, (n, periods, `kernels.MEMORY_SIZE`): each environment's memory after
             each period that it drove.
@@ -197,21 +203,26 @@ class ClosedLoop:
                 f"trace must be a writable C-ordered float64 array "
                 f"{(n, periods, k.MEMORY_SIZE)}, not {trace.dtype} {trace.shape}"
             )
-        progress, asked = np.zeros(n, dtype=np.int64), np.full(n, loops.ASKED)
+        since, progress, asked = (
+            np.full(n, NO_BAND),
+            np.zeros(n, dtype=np.int64),
+            np.full(n, loops.ASKED),
+        )
         tally = np.zeros((n, loops.TALLY))
-        memory, arrays = self.memory, self.envs.arrays
+        memory, nmpc, arrays = self.memory, self.memory.nmpc, self.envs.arrays
         arguments = (
-            periods, *arrays, self._looked, self._commands, self._feet, self._future, sets, rules,
-            memory.bands, memory.weights, until_band, self.agent.solver.constants, memory.plans,
-            memory.flags, memory.told, memory.states, memory.actions, progress, asked, tally,
-            trace,
+            periods, *arrays, memory.looked, memory.commands, memory.feet, self._future, sets,
+            rules, nmpc.bands, nmpc.weights, memory.watched, until_band, since,
+            *(NOBODY if self._decider is None or weights is not None else self._decider.arguments),
+            self.agent.solver.constants, nmpc.plans, nmpc.flags, nmpc.told, nmpc.states,
+            nmpc.actions, progress, asked, tally, trace,
         )  # fmt: skip
         while True:
             self._call(arguments)
             stuck = np.flatnonzero(asked == loops.HELD)
             if stuck.size == 0:
                 return Tally(*tally.T.copy())
-            self.agent.replace_failed(self._looked, memory, stuck)
+            self.agent.replace_failed(memory.looked, nmpc, stuck)
             asked[stuck] = loops.GIVEN
 
     def _call(self, arguments: tuple[Any, ...]) -> None:
@@ -238,20 +249,13 @@ class ClosedLoop:
         What they drive from there on is the same, disturbances included, under the same weights.
         """
         rows, onto = np.asarray(source, dtype=np.intp), np.asarray(target, dtype=np.intp)
-        memory = self.memory
         self.envs.copy(rows, onto)
-        for array in (
-            memory.plans, memory.flags, memory.told, memory.states, memory.actions, memory.bands,
-            memory.weights, self._looked, self._commands, self._feet,
-        ):  # fmt: skip
-            array[onto] = array[rows]
-        for row, other in zip(rows.tolist(), onto.tolist(), strict=True):
-            memory.ladders.pop(other, None)
-            if row in memory.ladders:
-                memory.ladders[other] = copy.deepcopy(memory.ladders[row])
+        self.memory.copy(rows, onto)
 
     def _checked_weights(self, weights: ArrayLike | None) -> tuple[Array, Array]:
         """Tables (1 or n, bands, 10) and the rules by which a band is chosen."""
+        if weights is None and self._decider is not None:
+            return self.memory.tables, self._rules
         if weights is None:
             return self.agent.switching.tables, self.agent.switching.rules
         values = np.asarray(weights, dtype=np.float64)

@@ -10,6 +10,9 @@ from agents.delay_kernels import look_ahead
 from agents.nmpc import rti
 from agents.nmpc.program import INNER
 from agents.nmpc.switching import NO_BAND, choose_weights, update_band
+from agents.weight_tuning.deciding import reconsider
+from agents.weight_tuning.watching import CLOCK, FAILURES, FRESH, watch
+from agents.weight_tuning.watching import ITERATIONS as ITERATED
 from lpv_track_env import conditions_layout
 from lpv_track_env import kernels as k
 from lpv_track_env.conditions_episode import drive_under_conditions
@@ -72,21 +75,49 @@ def remember(commands: Array, a: Any, delta: Any) -> None:
 
 
 @compiled
+def attend(
+    row: int, observations: Array, looked: Array, commands: Array, feet: Array, future: Array,
+    nodes: Array, rules: Array, bands: Array, watched: Array, actions: Array, steps: int,
+    period: Any,
+) -> None:  # fmt: skip
+    """Take in a vehicle's observation, once: what the NMPC is shown, the band, what is watched."""
+    if watched[row, FRESH] > 0.0:
+        return
+    look(observations[row], commands[row], feet[row], future, nodes, looked[row])
+    update_band(looked[row], steps, rules, bands, row)
+    watch(watched[row], observations[row], actions[row, 0], actions[row, 1], period)
+
+
+@compiled
 def decide(
-    row: int, asked: int, observations: Array, looked: Array, commands: Array, feet: Array,
-    future: Array, nodes: Array, tables: Array, rules: Array, bands: Array, weights: Array,
-    until_band: bool, constants: Array, plans: Array, flags: Array, told: Array, states: Array,
-    actions: Array, sums: Array, stages: Array, lanes: Array,
+    row: int, asked: int, period: Any, observations: Array, looked: Array, commands: Array,
+    feet: Array, future: Array, tables: Array, rules: Array, bands: Array, weights: Array,
+    watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
+    matrix: Array, log_span: Any, catalogue: Array, scales: Array, window: int, constants: Array,
+    plans: Array, flags: Array, told: Array, states: Array, actions: Array, sums: Array,
+    nodes: Array, scratch: Array, stages: Array, lanes: Array,
 ) -> int:  # fmt: skip
-    """Fill a vehicle's row of `actions`; HELD if its solve has failed, PAUSED at a band's end."""
+    """Fill a vehicle's row of `actions`; HELD if its solve has failed, PAUSED at a band's end.
+
+    With `until_band`, `since` (n,) is the band in which the call found the vehicle. Where there are
+    `layers`, a policy writes the table of weights.
+    """
     if asked == ASKED:
-        look(observations[row], commands[row], feet[row], future, nodes, looked[row])
+        attend(
+            row, observations, looked, commands, feet, future, nodes, rules, bands, watched,
+            actions, lanes.shape[1], period,
+        )  # fmt: skip
         if until_band:
-            before = bands[row]
-            update_band(looked[row], lanes.shape[1], rules, bands, row)
-            if before not in (NO_BAND, bands[row]):
+            if since[row] == NO_BAND:
+                since[row] = bands[row]
+            if since[row] != bands[row]:
                 return PAUSED
         own = row if tables.shape[0] > 1 else 0
+        if layers.shape[0] > 0:
+            reconsider(
+                observations[row], watched[row], weights[row], bands[row], network, layers, sets,
+                matrix, log_span, catalogue, scales, window, tables[own], scratch,
+            )  # fmt: skip
         choose_weights(looked[row], lanes.shape[1], tables[own], rules, bands, row, weights[row])
         failed = rti.control(
             row, looked[row : row + 1], weights[row : row + 1], constants, plans, flags, told,
@@ -94,12 +125,21 @@ def decide(
         )  # fmt: skip
         sums[ITERATIONS] += told[row, INNER]
         sums[SOLVES] += 1.0
+        watched[row, ITERATED] += told[row, INNER]
         if failed > 0:
             sums[FAILED] += 1.0
+            watched[row, FAILURES] += 1.0
             return HELD
     if future.shape[0] > 0:
         remember(commands[row], actions[row, 0], actions[row, 1])
     return ASKED
+
+
+@compiled_internal
+def passed(watched: Array) -> None:
+    """Note that a control period has passed."""
+    watched[FRESH] = 0.0
+    watched[CLOCK] += 1.0
 
 
 @compiled
@@ -107,27 +147,32 @@ def drive_rows(
     first: int, last: int, periods: int, memories: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
     feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
-    until_band: bool, constants: Array, plans: Array, flags: Array, told: Array, states: Array,
-    actions: Array, progress: Array, asked: Array, tally: Array, trace: Array, nodes: Array,
-    stages: Array, lanes: Array,
+    watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
+    matrix: Array, log_span: Any, catalogue: Array, scales: Array, window: int, constants: Array,
+    plans: Array, flags: Array, told: Array, states: Array, actions: Array, progress: Array,
+    asked: Array, tally: Array, trace: Array, nodes: Array, scratch: Array, stages: Array,
+    lanes: Array,
 ) -> None:  # fmt: skip
     """Drive vehicles first to last - 1 until `progress` (n,) reaches `periods` or they end.
 
     One whose solve fails stays where it is, `asked` (n,) HELD; set to GIVEN it goes on with its row
     of `actions` in place of that solve. With `until_band` one waits, PAUSED, where the preview's
-    band changes, and in the end `bands` are those of the next period. `trace` (n, periods or 0,
-    MEMORY_SIZE) gets every memory. `nodes`, `stages` and `lanes` are working space.
+    band changes, and in the end `bands` and `watched` are those of the next period. `trace`
+    (n, periods or 0, MEMORY_SIZE) gets every memory. `nodes`, `scratch`, `stages` and `lanes` are
+    working space.
     """
     for row in range(first, last):
         if asked[row] == HELD or asked[row] == PAUSED:
             continue
         memory, case = memories[row], cases[row]
         table = tables[rows[case, 0] : rows[case, 1]]
+        period = env_constants[case, k.PERIOD]
         while progress[row] < periods and ends[row] == k.RUNNING:
             asked[row] = decide(
-                row, asked[row], observations, looked, commands, feet, future, nodes,
-                weight_tables, rules, bands, weights, until_band, constants, plans, flags, told,
-                states, actions, tally[row], stages, lanes,
+                row, asked[row], period, observations, looked, commands, feet, future,
+                weight_tables, rules, bands, weights, watched, until_band, since, network, layers,
+                sets, matrix, log_span, catalogue, scales, window, constants, plans, flags, told,
+                states, actions, tally[row], nodes, scratch, stages, lanes,
             )  # fmt: skip
             if asked[row] != ASKED:
                 break
@@ -139,10 +184,13 @@ def drive_rows(
             if trace.shape[1] > 0:
                 copy(memory, trace[row, progress[row]])
             progress[row] += 1
-            count(memory, before_a, before_delta, env_constants[case, k.PERIOD], tally[row])
+            count(memory, before_a, before_delta, period, tally[row])
+            passed(watched[row])
         if until_band and asked[row] == ASKED and ends[row] == k.RUNNING:
-            look(observations[row], commands[row], feet[row], future, nodes, looked[row])
-            update_band(looked[row], lanes.shape[1], rules, bands, row)
+            attend(
+                row, observations, looked, commands, feet, future, nodes, rules, bands, watched,
+                actions, lanes.shape[1], period,
+            )  # fmt: skip
 
 
 @compiled
@@ -150,9 +198,11 @@ def drive_rows_under_conditions(
     first: int, last: int, periods: int, memories: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
     feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
-    until_band: bool, constants: Array, plans: Array, flags: Array, told: Array, states: Array,
-    actions: Array, progress: Array, asked: Array, tally: Array, trace: Array, nodes: Array,
-    stages: Array, lanes: Array, vehicles: Array, specs: Array, draws: Array, work: Array,
+    watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
+    matrix: Array, log_span: Any, catalogue: Array, scales: Array, window: int, constants: Array,
+    plans: Array, flags: Array, told: Array, states: Array, actions: Array, progress: Array,
+    asked: Array, tally: Array, trace: Array, nodes: Array, scratch: Array, stages: Array,
+    lanes: Array, vehicles: Array, specs: Array, draws: Array, work: Array,
 ) -> None:  # fmt: skip
     """`drive_rows` under conditions, see `conditions_vector.advance` for the last four arrays."""
     for row in range(first, last):
@@ -168,9 +218,10 @@ def drive_rows_under_conditions(
                 remember(commands[row], commands[row, 0, 0], commands[row, 0, 1])
             else:
                 asked[row] = decide(
-                    row, asked[row], observations, looked, commands, feet, future, nodes,
-                    weight_tables, rules, bands, weights, until_band, constants, plans, flags,
-                    told, states, actions, tally[row], stages, lanes,
+                    row, asked[row], period, observations, looked, commands, feet, future,
+                    weight_tables, rules, bands, weights, watched, until_band, since, network,
+                    layers, sets, matrix, log_span, catalogue, scales, window, constants, plans,
+                    flags, told, states, actions, tally[row], nodes, scratch, stages, lanes,
                 )  # fmt: skip
                 if asked[row] != ASKED:
                     break
@@ -183,9 +234,12 @@ def drive_rows_under_conditions(
                 copy(memory, trace[row, progress[row]])
             progress[row] += 1
             count(memory, before_a, before_delta, period, tally[row])
+            passed(watched[row])
         if until_band and asked[row] == ASKED and ends[row] == k.RUNNING:
-            look(observations[row], commands[row], feet[row], future, nodes, looked[row])
-            update_band(looked[row], lanes.shape[1], rules, bands, row)
+            attend(
+                row, observations, looked, commands, feet, future, nodes, rules, bands, watched,
+                actions, lanes.shape[1], period,
+            )  # fmt: skip
 
 
 @compiled_parallel
@@ -193,17 +247,21 @@ def drive_in_threads(
     chunks: int, n: int, periods: int, memories: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
     feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
-    until_band: bool, constants: Array, plans: Array, flags: Array, told: Array, states: Array,
-    actions: Array, progress: Array, asked: Array, tally: Array, trace: Array, nodes: Array,
-    stages: Array, lanes: Array,
+    watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
+    matrix: Array, log_span: Any, catalogue: Array, scales: Array, window: int, constants: Array,
+    plans: Array, flags: Array, told: Array, states: Array, actions: Array, progress: Array,
+    asked: Array, tally: Array, trace: Array, nodes: Array, scratch: Array, stages: Array,
+    lanes: Array,
 ) -> None:  # fmt: skip
     """`drive_rows` on all n, in chunks that threads share; each has its own working space."""
     for chunk in numba.prange(chunks):
         drive_rows(
             chunk * n // chunks, (chunk + 1) * n // chunks, periods, memories, observations, ends,
             cases, env_constants, tables, rows, looked, commands, feet, future, weight_tables,
-            rules, bands, weights, until_band, constants, plans, flags, told, states, actions,
-            progress, asked, tally, trace, nodes[chunk], stages[chunk], lanes[chunk],
+            rules, bands, weights, watched, until_band, since, network, layers, sets, matrix,
+            log_span, catalogue, scales, window, constants, plans, flags, told, states, actions,
+            progress, asked, tally, trace, nodes[chunk], scratch[chunk], stages[chunk],
+            lanes[chunk],
         )  # fmt: skip
 
 
@@ -212,16 +270,20 @@ def drive_in_threads_under_conditions(
     chunks: int, n: int, periods: int, memories: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
     feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
-    until_band: bool, constants: Array, plans: Array, flags: Array, told: Array, states: Array,
-    actions: Array, progress: Array, asked: Array, tally: Array, trace: Array, nodes: Array,
-    stages: Array, lanes: Array, vehicles: Array, specs: Array, draws: Array, work: Array,
+    watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
+    matrix: Array, log_span: Any, catalogue: Array, scales: Array, window: int, constants: Array,
+    plans: Array, flags: Array, told: Array, states: Array, actions: Array, progress: Array,
+    asked: Array, tally: Array, trace: Array, nodes: Array, scratch: Array, stages: Array,
+    lanes: Array, vehicles: Array, specs: Array, draws: Array, work: Array,
 ) -> None:  # fmt: skip
     """`drive_in_threads` under conditions."""
     for chunk in numba.prange(chunks):
         drive_rows_under_conditions(
             chunk * n // chunks, (chunk + 1) * n // chunks, periods, memories, observations, ends,
             cases, env_constants, tables, rows, looked, commands, feet, future, weight_tables,
-            rules, bands, weights, until_band, constants, plans, flags, told, states, actions,
-            progress, asked, tally, trace, nodes[chunk], stages[chunk], lanes[chunk], vehicles,
-            specs, draws, work[chunk],
+            rules, bands, weights, watched, until_band, since, network, layers, sets, matrix,
+            log_span, catalogue, scales, window, constants, plans, flags, told, states, actions,
+            progress, asked, tally, trace, nodes[chunk], scratch[chunk], stages[chunk],
+            lanes[chunk], vehicles, specs,
+            draws, work[chunk],
         )  # fmt: skip

@@ -1,0 +1,139 @@
+"""What a chooser of weights is shown: features of about one, the same for left and right.
+
+====================  =====  ===================================================================
+features              count  meaning, and what they are divided by
+====================  =====  ===================================================================
+situation             8      vx - 10 m/s (10), |vy| (0.5 m/s), |r| (0.3 rad/s), reported a
+                             (2 m/s^2), |reported delta| (0.2 rad), |lateral error| (0.1 m),
+                             |heading error| (0.1 rad), speed error (1 m/s)
+preview               6      largest |curvature| in each quarter of the preview (0.05 1/m); speed in
+                             its middle and at its end, less that now (5 m/s)
+quick, slow           20     `watching.STATISTICS` over 0.4 s and over 4 s: ln(rms / scale) / 2, rms
+                             of at least 3 % of the scale
+solver                2      mean iterations since the last decision (10), share of failed solves
+weights               8      ln(Q, S in use / base) / ln(span)
+band                  B      1 for the band of the preview, 0 for the others
+====================  =====  ===================================================================
+
+Every entry is clipped to [-LIMIT, LIMIT].
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.weight_tuning.watching import (
+    CLOCK,
+    COUNT,
+    FAILURES,
+    ITERATIONS,
+    QUICK,
+    SLOW,
+    STATISTICS,
+)
+from lpv_track_env.kernels import PREVIEW_START
+from trajectories.compilation import compiled, compiled_internal
+
+Array = NDArray[Any]
+
+LIMIT = 5.0
+TUNED = 8
+"""Weights that are chosen: Q and S; only ratios matter, so R stays."""
+QUARTERS = 4
+SCALES = np.array([0.05, 0.05, 0.5, 0.02, 0.01, 0.02, 0.5, 0.2, 2.0, 0.2])
+"""Of the statistics, in their order and units."""
+LEAST = 1e-3
+"""Of a mean square over its scale's."""
+
+SITUATION = (
+    "longitudinal_speed", "lateral_speed", "yaw_rate", "acceleration", "steering_angle",
+    "lateral_error", "heading_error", "speed_error",
+)  # fmt: skip
+SHARED = (
+    *SITUATION,
+    *(f"curvature_{quarter}" for quarter in range(1, QUARTERS + 1)), "speed_middle", "speed_end",
+    *(f"quick_{name}" for name in STATISTICS), *(f"slow_{name}" for name in STATISTICS),
+    "iterations", "failures",
+    *(f"weight_{matrix}_{state}" for matrix in "QS" for state in ("vx", "psi", "x", "y")),
+)  # fmt: skip
+"""Names of all entries but those of the bands."""
+
+
+def names(bands: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of all entries, for bands of such names."""
+    return (*SHARED, *(f"band_{name}" for name in bands))
+
+
+def size(bands: int) -> int:
+    """Number of entries."""
+    return len(SHARED) + bands
+
+
+@compiled_internal
+def bounded(value: Any) -> Any:
+    """A value within the limits; what is no number becomes 0."""
+    if math.isnan(value):
+        return 0.0
+    return min(max(value, -LIMIT), LIMIT)
+
+
+@compiled
+def fill_features(
+    o: Array, w: Array, used: Array, base: Array, band: int, scales: Array, log_span: Any, x: Array
+) -> None:
+    """Fill `x` (size,) for an observation `o` and its drive's `watching` row `w`.
+
+    `used` (10,) are the weights in use, of zeros before the first; `base` (bands, 10) those that
+    are multiplied; `band` may be -1.
+    """
+    steps = (o.shape[0] - PREVIEW_START) // 2
+    x[0] = bounded(o[0] / 10.0 - 1.0)
+    x[1] = bounded(abs(o[1]) / 0.5)
+    x[2] = bounded(abs(o[2]) / 0.3)
+    x[3] = bounded(o[3] / 2.0)
+    x[4] = bounded(abs(o[4]) / 0.2)
+    x[5] = bounded(abs(o[5]) / 0.1)
+    x[6] = bounded(abs(o[6]) / 0.1)
+    x[7] = bounded(o[0] - o[7])
+    at = 8
+    for quarter in range(QUARTERS):
+        largest = 0.0
+        for k in range(quarter * steps // QUARTERS, (quarter + 1) * steps // QUARTERS):
+            largest = max(largest, abs(o[PREVIEW_START + k]))
+        x[at] = bounded(largest / 0.05)
+        at += 1
+    speeds = PREVIEW_START + steps
+    x[at] = bounded((o[speeds + (steps - 1) // 2] - o[7]) / 5.0)
+    x[at + 1] = bounded((o[speeds + steps - 1] - o[7]) / 5.0)
+    at += 2
+    for means in (QUICK, SLOW):
+        for j in range(COUNT):
+            square = w[means + j] / (scales[j] * scales[j])
+            x[at] = bounded(0.25 * math.log(square + LEAST))
+            at += 1
+    since = max(w[CLOCK], 1.0)
+    x[at] = bounded(w[ITERATIONS] / since / 10.0)
+    x[at + 1] = bounded(w[FAILURES] / since)
+    at += 2
+    own = max(band, 0)
+    for j in range(TUNED):
+        ratio = used[j] / base[own, j] if used[j] > 0.0 else 1.0
+        x[at + j] = bounded(math.log(ratio) / log_span)
+    at += TUNED
+    for k in range(base.shape[0]):
+        x[at + k] = 1.0 if k == band else 0.0
+
+
+@compiled
+def fill_all(
+    observations: Array, watched: Array, used: Array, base: Array, bands: Array, scales: Array,
+    log_span: Any, features: Array,
+) -> None:  # fmt: skip
+    """`fill_features` for every row: `features` (n, size) float32."""
+    for row in range(observations.shape[0]):
+        fill_features(
+            observations[row], watched[row], used[row], base, bands[row], scales, log_span,
+            features[row],
+        )  # fmt: skip
