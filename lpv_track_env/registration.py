@@ -8,6 +8,7 @@ Nothing heavy is imported here.
 import gymnasium
 
 PATH_TRACKING = "lpv_track_env/PathTracking-v0"
+WEIGHT_TUNING = "lpv_track_env/WeightTuning-v0"
 
 
 def register() -> None:
@@ -20,4 +21,9 @@ def register() -> None:
             # The environment refuses by itself what these wrappers would: each costs time.
             order_enforce=False,
             disable_env_checker=True,
+        )
+        gymnasium.register(
+            id=WEIGHT_TUNING,
+            entry_point="agents.weight_tuning.env:WeightTuningEnv",
+            vector_entry_point="agents.weight_tuning.vector_env:WeightTuningVectorEnv",
         )

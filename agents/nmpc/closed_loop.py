@@ -225,6 +225,18 @@ class ClosedLoop:
             self.agent.replace_failed(memory.looked, nmpc, stuck)
             asked[stuck] = loops.GIVEN
 
+    def attend(self, mask: Array) -> None:
+        """Take in the observations of environments that `mask` (n,) marks, before they drive on.
+
+        Bands and what is watched are up to date then; `drive` does the same by itself.
+        """
+        memory, arrays = self.memory, self.envs.arrays
+        loops.attend_rows(
+            mask, arrays.observations, memory.looked, memory.commands, memory.feet, self._future,
+            self._work[0][0], self._rules, memory.nmpc.bands, memory.watched, memory.nmpc.actions,
+            self.agent.problem.horizon, self.envs.single.control_period,
+        )  # fmt: skip
+
     def _call(self, arguments: tuple[Any, ...]) -> None:
         """Drive all that are not HELD or PAUSED, in threads if the loop has them."""
         n, given = self.envs.num_envs, self.envs.condition_arrays

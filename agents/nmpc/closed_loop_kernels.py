@@ -89,6 +89,21 @@ def attend(
 
 
 @compiled
+def attend_rows(
+    mask: Array, observations: Array, looked: Array, commands: Array, feet: Array, future: Array,
+    nodes: Array, rules: Array, bands: Array, watched: Array, actions: Array, steps: int,
+    period: Any,
+) -> None:  # fmt: skip
+    """`attend` for every row that `mask` (n,) marks."""
+    for row in range(mask.shape[0]):
+        if mask[row]:
+            attend(
+                row, observations, looked, commands, feet, future, nodes, rules, bands, watched,
+                actions, steps, period,
+            )  # fmt: skip
+
+
+@compiled
 def decide(
     row: int, asked: int, period: Any, observations: Array, looked: Array, commands: Array,
     feet: Array, future: Array, tables: Array, rules: Array, bands: Array, weights: Array,

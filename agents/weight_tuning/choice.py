@@ -169,3 +169,19 @@ def weights_for(
             exponent += matrix[j, column] * min(max(action[column], -1.0), 1.0)
         chosen[j] = min(max(chosen[j] * math.exp(log_span * exponent), LOWEST), HIGHEST)
     return True
+
+
+@compiled
+def weights_for_all(
+    actions: Array, mask: Array, bands: Array, sets: Array, matrix: Array, log_span: Any,
+    catalogue: Array, tables: Array, refused: Array,
+) -> None:  # fmt: skip
+    """`weights_for` for every row that `mask` marks, in its band's row of `tables` (n, bands, 10).
+
+    `refused` (n,) tells of which actions nothing could be made.
+    """
+    for row in range(actions.shape[0]):
+        refused[row] = mask[row] and not weights_for(
+            actions[row], bands[row], sets, matrix, log_span, catalogue,
+            tables[row, max(bands[row], 0)],
+        )  # fmt: skip

@@ -1,0 +1,143 @@
+"""`lpv_track_env/WeightTuning-v0`: an NMPC drives, the action chooses its weights."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from agents.weight_tuning.choice import WeightChoice
+from agents.weight_tuning.vector_env import WeightTuningVectorEnv
+from lpv_track_env.conditions import Conditions
+from lpv_track_env.vehicle import VehicleParameters
+from trajectories import ReferencePath
+
+Array = NDArray[Any]
+
+
+class WeightTuningEnv(gymnasium.Env[NDArray[np.float32], Any]):
+    """A vehicle follows a reference path with `lpv-nmpc`; an action chooses the NMPC's Q and S.
+
+    One step drives a window of control periods (0.4 s), or up to where the preview enters another
+    band of curvature, with the weights that the action chooses for the band at hand.
+
+    ## Action space
+
+    Box in [-1, 1], float32: logarithms of what the base's Q and S of this band are multiplied by,
+    in units of ln(span); an entry each for speed, heading and position ("joint"), for these in Q
+    and then in S ("stages"), or for each of Q and S on [vx, psi, X, Y] ("all"). With a catalogue,
+    Discrete: which of its sets is taken. R stays: only ratios matter.
+
+    Weights move at the base's slew limit, within the bounds of `TrackingWeights`; the NMPC keeps
+    its warm start. Entries beyond [-1, 1] are clipped, an action with one that is not finite leaves
+    the weights as they are; both are counted in infos and the drive goes on.
+
+    ## Observation space
+
+    Box of features, float32: `agents.weight_tuning.features` names every entry and its scale. They
+    are made of what the agent itself sees and does: errors, preview, band, weights in use, solver,
+    and mean squares of errors, surprises and lags over 0.4 s and 4 s. The truth is not among them.
+
+    ## Reward
+
+    Minus the parts of the score (`agents.weight_tuning.score`) over the window, times its share of
+    a whole window; of the truth. A drive that fails ends with minus 250: ten windows of the worst.
+
+    ## Episode
+
+    As in `PathTrackingEnv`: terminated at the path's end, off the road or turned around; truncated
+    at the time limit.
+
+    ## Infos
+
+    `parts` (5,) of the window; `steps`, `solves`, `failures` of the window; `band`; `weights` (10,)
+    in use; `rejected`, `clipped` actions of the episode; at its end `end` and its `score`.
+
+    ## Arguments
+
+    Those of `PathTrackingEnv` but its reward's weights, and
+
+    choice
+        `agents.weight_tuning.choice.WeightChoice`: base, bands, directions, span or catalogue,
+        window.
+    conditions
+        "realtime" by default: where weights matter.
+    delay_compensation
+        As in `agents.make`.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(
+        self,
+        trajectory: str | Path | ReferencePath = "T1",
+        vehicle: str | Path | VehicleParameters = "m2-minibus",
+        speed_mode: str = "variable",
+        fixed_speed: float | None = None,
+        conditions: str | Conditions | dict[str, Any] = "realtime",
+        control_period: float = 0.05,
+        render_mode: str | None = None,
+        *,
+        choice: WeightChoice | None = None,
+        delay_compensation: bool | None = None,
+        preview_steps: int = 20,
+        preview_period: float | None = None,
+        max_lateral_error: float = 5.0,
+        time_limit: float | None = None,
+        initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        random_start: bool = False,
+    ) -> None:
+        self.drives = WeightTuningVectorEnv(
+            1, trajectory, vehicle, speed_mode, fixed_speed, conditions, control_period,
+            render_mode, choice=choice, delay_compensation=delay_compensation,
+            preview_steps=preview_steps, preview_period=preview_period,
+            max_lateral_error=max_lateral_error, time_limit=time_limit,
+            initial_error_range=initial_error_range, random_start=random_start,
+            autoreset_mode=AutoresetMode.DISABLED,
+        )  # fmt: skip
+        self.choice, self.render_mode = self.drives.choice, render_mode
+        self.observation_space = self.drives.single_observation_space
+        self.action_space = self.drives.single_action_space
+        self.metadata = {
+            **self.metadata, "render_fps": round(1.0 / self.choice.window),
+        }  # fmt: skip
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode; options are those of `PathTrackingEnv`."""
+        super().reset(seed=seed)
+        given = {key: value for key, value in (options or {}).items() if key != "reset_mask"}
+        observations, infos = self.drives.reset(seed=seed, options=given)
+        return observations[0], _single(infos)
+
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Drive a window with the weights that are chosen; see the class."""
+        actions = np.asarray(action)[None]
+        observations, rewards, terminated, truncated, infos = self.drives.step(actions)
+        return (
+            observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]),
+            _single(infos),
+        )  # fmt: skip
+
+    def render(self) -> Any:
+        """Draw the vehicle on its path: (600, 900, 3) uint8."""
+        frames = self.drives.render()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        """Free what drawing took."""
+        self.drives.close()
+
+
+def _single(infos: dict[str, Any]) -> dict[str, Any]:
+    """Infos of a vector environment of one, as a single environment's."""
+    single = {}
+    for name, values in infos.items():
+        if name.startswith("_"):
+            continue
+        value = values[0]
+        single[name] = value.item() if isinstance(value, np.generic) else value
+    return single
