@@ -60,6 +60,11 @@ class DrivingTask:
     """Delays and lags between a command and its effect, nominal (s)."""
 
     @property
+    def delayed(self) -> bool:
+        """Whether there are any."""
+        return any(time > 0.0 for time in self.actuation)
+
+    @property
     def action_bounds(self) -> tuple[Action, Action]:
         """The action space's own float32 bounds, (2,): an action clipped to them lies in it."""
         low, high = self.vehicle.acceleration_range

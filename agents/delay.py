@@ -92,7 +92,7 @@ class NearFuture:
     def look(self, rows: Array, starts: NDArray[np.bool_], memory: "DelayMemory") -> None:
         """Move observations, rows (n, size) float64, in place; `starts` (n,) begin episodes."""
         # Before the first command the actuators have stood where they are.
-        memory.commands[starts] = np.nan_to_num(rows[starts, None, 3:5])
+        memory.commands[starts] = np.nan_to_num(rows[starts, None, 3:5], posinf=0.0, neginf=0.0)
         delay_kernels.look_ahead_all(rows, memory.commands, self.settings, self._nodes, memory.feet)
 
     @staticmethod
@@ -181,8 +181,13 @@ class DelayCompensated:
         explain = getattr(self.agent, "diagnostics", None)
         told: dict[str, Any] = {} if explain is None else explain(memory.inner)
         if told.get("plan") is not None:
-            x, y, heading = memory.foot
-            c, s = math.cos(heading), math.sin(heading)
-            turned = told["plan"] @ np.array([[c, s], [-s, c]])
-            told = {**told, "plan": turned + np.array([x, y])}
+            told = {**told, "plan": moved_plan(told["plan"], memory.foot)}
         return told
+
+
+def moved_plan(plan: Array, foot: Array) -> Array:
+    """Positions (n, 2) in the frame of a foot point, in that from which its pose (3,) is seen."""
+    x, y, heading = foot
+    c, s = math.cos(heading), math.sin(heading)
+    moved: Array = plan @ np.array([[c, s], [-s, c]]) + np.array([x, y])
+    return moved

@@ -17,6 +17,7 @@ from agents.base import Agent, DrivingTask
 
 REGISTRY: dict[str, str] = {
     "lpv-nmpc": "agents.nmpc.rti_agent:RtiNmpc",
+    "lpv-nmpc-tuned": "agents.weight_tuning.agent:TunedNmpc",
     "lpv-nmpc-ipopt": "agents.nmpc.agent:IpoptNmpc",
     "lpv-mpc-frozen": "agents.nmpc.frozen:FrozenLpvMpc",
     "stanley": "agents.geometric:Stanley",
@@ -37,7 +38,7 @@ POLICY_FILES = (".json", ".safetensors", ".zip")
 """How the name of a learned policy's file ends; of the last two it is said what to give instead."""
 
 COMMON = ("delay_compensation",)
-"""Settings that `make` itself takes, for every agent."""
+"""Settings that `make` itself takes, for every agent; some classes take it from there."""
 
 
 def names() -> list[str]:
@@ -154,7 +155,7 @@ def make(
     delay_compensation
         Whether it is shown the observation of the time at which its action lands
         (`agents.delay.DelayCompensated`); by default where the environment's conditions have
-        delays.
+        delays. A class that says `compensates_delays` is handed this instead.
 
     Raises
     ------
@@ -163,13 +164,16 @@ def make(
     """
     cls = agent_class(name)
     check_settings(name, settings)
+    itself = getattr(cls, "compensates_delays", False)
+    if itself:
+        settings["delay_compensation"] = delay_compensation
     try:
         task = DrivingTask.of(env)
         agent: Agent = cls(task, **settings)
     except TypeError as error:
         raise ValueError(f"agent {name!r}: {error}") from error
-    delayed = any(time > 0.0 for time in task.actuation)
-    if delayed if delay_compensation is None else delay_compensation:
+    compensated = task.delayed if delay_compensation is None else delay_compensation
+    if compensated and not itself:
         from agents.delay import DelayCompensated
 
         agent = DelayCompensated(agent, task, task.actuation, settings.get("model"))

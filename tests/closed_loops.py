@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 import agents
 from agents.nmpc.closed_loop import ClosedLoop, Tally
 from agents.nmpc.rti_agent import RtiNmpc
+from agents.weight_tuning.agent import TunedNmpc
 from lpv_track_env import conditions_layout as layout
 from lpv_track_env import kernels as k
 from lpv_track_env.vector_env import PathTrackingVectorEnv
@@ -53,12 +54,15 @@ def busy(env: PathTrackingVectorEnv) -> bool:
 class InTurns:
     """n environments of one each, with an agent each: `predict`, then `step`, in Python."""
 
-    def __init__(self, n: int, settings: dict[str, Any], sets: Array | None, **more: Any) -> None:
+    def __init__(
+        self, n: int, settings: dict[str, Any], sets: Array | None, name: str = "lpv-nmpc",
+        **more: Any,
+    ) -> None:  # fmt: skip
         self.envs = [environments(1, **settings) for _ in range(n)]
         self.agents: list[Any] = []
         for i, env in enumerate(self.envs):
-            agent: Any = agents.make("lpv-nmpc", env.single, **more)
-            assert isinstance(getattr(agent, "agent", agent), RtiNmpc)
+            agent: Any = agents.make(name, env.single, **more)
+            assert isinstance(getattr(agent, "agent", agent), (RtiNmpc, TunedNmpc))
             assert sets is None or agent.set_weights(sets[i])
             self.agents.append(agent)
         self.failures, self.iterations = np.zeros(n), np.zeros(n)

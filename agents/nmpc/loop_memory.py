@@ -1,6 +1,7 @@
 """What compiled code remembers of n vehicles beside their NMPCs: what they were shown and sent."""
 
 import copy
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from agents.delay import NearFuture
 from agents.delay_kernels import FOOT
 from agents.nmpc.rti_agent import RtiMemory
-from agents.weight_tuning.watching import WATCH
+from agents.weight_tuning.watching import CLOCK, FRESH, WATCH
 
 Array = NDArray[Any]
 
@@ -49,11 +50,16 @@ class LoopMemory:
     def __len__(self) -> int:
         return len(self.nmpc)
 
+    def __getitem__(self, row: int) -> "LoopRow":
+        if not -len(self) <= row < len(self):
+            raise IndexError(f"row {row} of {len(self)}")
+        return LoopRow(self, row % len(self))
+
     def clear(self, row: int, observation: Array) -> None:
         """Forget a row: an episode begins there with an observation."""
         self.nmpc.clear(row)
         # Before the first command the actuators have stood where they are.
-        self.commands[row] = np.nan_to_num(observation[3:5])
+        self.commands[row] = np.nan_to_num(observation[3:5], posinf=0.0, neginf=0.0)
         self.watched[row] = 0.0
         self.tables[row] = self._sets
 
@@ -61,6 +67,12 @@ class LoopMemory:
         """Remember the actions of some rows as sent."""
         self.commands[rows, 1:] = self.commands[rows, :-1].copy()
         self.commands[rows, 0] = self.nmpc.actions[rows]
+
+    def hold(self) -> None:
+        """Let a control period pass without an action: of every row the last command stays."""
+        self.commands[:, 1:] = self.commands[:, :-1].copy()
+        self.watched[:, FRESH] = 0.0
+        self.watched[:, CLOCK] += 1.0
 
     def copy(self, rows: Array, onto: Array) -> None:
         """Make rows `onto` (m,) those that `rows` (m,) are."""
@@ -74,3 +86,11 @@ class LoopMemory:
             nmpc.ladders.pop(other, None)
             if row in nmpc.ladders:
                 nmpc.ladders[other] = copy.deepcopy(nmpc.ladders[row])
+
+
+@dataclass(frozen=True)
+class LoopRow:
+    """One vehicle's part of a `LoopMemory`."""
+
+    memory: LoopMemory
+    row: int
