@@ -337,7 +337,10 @@ servo to a slow one, no dead time to two periods of 0.05 s. What weights are tun
 
 SIMULATION = "simulation"
 PRESETS: dict[str, Conditions | None] = {
-    SIMULATION: None, "realtime": REALTIME, "randomised": RANDOMISED, "ideal": IDEAL,
+    SIMULATION: None,
+    "realtime": REALTIME,
+    "randomised": RANDOMISED,
+    "ideal": IDEAL,
 }
 """Conditions by name; None stands for the ideal kernels."""
 

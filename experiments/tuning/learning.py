@@ -86,7 +86,7 @@ class PolicyLearning(Tuner):
         if self.choice.catalogue:
             # The default set, the first one, to begin with.
             with torch.no_grad():
-                self.model.policy.action_net.bias[0] = 2.0  # type: ignore[index, operator]
+                self.model.policy.action_net.bias[0] = 2.0  # type: ignore[operator]
 
     def _network(self) -> dict[str, Any]:
         network: dict[str, Any] = {
