@@ -30,7 +30,8 @@ FRESH, SEEN, CLOCK, DECIDED, FAILURES, ITERATIONS, REJECTED = range(7)
 """Whether the observation at hand is in; periods seen; periods since the last decision; the band it
 was made in, or -1; failed solves and iterations since then; decisions that were no numbers."""
 LAST = 7
-"""Last lateral and heading error, vx, vy, r, reported a and delta, commanded a and delta;"""
+"""Last lateral and heading error, vx, vy, rate of the heading error, reported a and delta, and
+commanded a and delta;"""
 QUICK, SLOW = LAST + 9, LAST + 9 + COUNT
 """mean squares over the short and the long time."""
 WATCH = SLOW + COUNT
@@ -61,7 +62,6 @@ def watch(w: Array, o: Array, a: Any, delta: Any, period: Any) -> None:
     if w[SEEN] > 0.0:
         last, before = w[LAST], w[LAST + 1]
         moved = w[LAST + 2] * math.sin(before) + w[LAST + 3] * math.cos(before)
-        turned = w[LAST + 4] - o[PREVIEW_START] * w[LAST + 2]
         share = 1.0 / w[SEEN]
         quick = max(1.0 - math.exp(-period / SHORT), share)
         slow = max(1.0 - math.exp(-period / LONG), share)
@@ -69,7 +69,7 @@ def watch(w: Array, o: Array, a: Any, delta: Any, period: Any) -> None:
         mean_in(w, 1, heading, quick, slow)
         mean_in(w, 2, vx - o[7], quick, slow)
         mean_in(w, 3, lateral - last - period * moved, quick, slow)
-        mean_in(w, 4, heading - before - period * turned, quick, slow)
+        mean_in(w, 4, heading - before - period * w[LAST + 4], quick, slow)
         mean_in(w, 5, delta - now_delta, quick, slow)
         mean_in(w, 6, a - now_a, quick, slow)
         mean_in(w, 7, (now_delta - w[LAST + 6]) / period, quick, slow)
@@ -80,5 +80,7 @@ def watch(w: Array, o: Array, a: Any, delta: Any, period: Any) -> None:
         w[DECIDED] = -1.0
         w[LAST + 7], w[LAST + 8] = now_a, now_delta
     w[SEEN] += 1.0
-    w[LAST], w[LAST + 1], w[LAST + 2], w[LAST + 3], w[LAST + 4] = lateral, heading, vx, vy, r
+    w[LAST], w[LAST + 1], w[LAST + 2], w[LAST + 3] = lateral, heading, vx, vy
+    # The preview's first curvature is that of the period to come.
+    w[LAST + 4] = r - o[PREVIEW_START] * vx
     w[LAST + 5], w[LAST + 6] = now_a, now_delta
