@@ -13,7 +13,17 @@ import trajectories
 from agents.weight_tuning import features
 from agents.weight_tuning.env import WeightTuningEnv
 from agents.weight_tuning.features import LIMIT, SCALES, fill_features
-from agents.weight_tuning.watching import LAST, QUICK, SEEN, SLOW, STATISTICS, WATCH, watch
+from agents.weight_tuning.watching import (
+    AGE,
+    LAST,
+    QUICK,
+    SEEN,
+    SLOW,
+    STATISTICS,
+    WATCH,
+    passed,
+    watch,
+)  # fmt: skip
 from agents.weights import HIGHEST, LOWEST
 from lpv_track_env.observation import ObservationLayout
 
@@ -137,7 +147,9 @@ def filled(o: Any, w: Array, used: Array | None = None, band: int = 0) -> Array:
 
 def watched(observations: Any, actions: Any) -> Array:
     w = np.zeros(WATCH)
-    for o, (a, delta) in zip(observations, actions, strict=True):
+    for period, (o, (a, delta)) in enumerate(zip(observations, actions, strict=True)):
+        if period > 0:
+            passed(w)
         watch(w, np.asarray(o, dtype=np.float32), float(a), float(delta), PERIOD)
     return w
 
@@ -168,14 +180,21 @@ def test_whatever_is_observed_gives_finite_features(
 
 
 def test_an_observation_that_is_not_finite_is_passed_over() -> None:
-    """It is forgotten, not taken for a jump there and back."""
+    """It is forgotten, not taken for a jump there and back; others are compared beyond it."""
     rng = np.random.default_rng(0)
     observations, actions = rng.normal(size=(6, 20)), rng.normal(size=(6, 2))
     broken = observations.copy()
     broken[3, 5] = np.nan
-    several = watched(broken[:4], actions[:4])
-    np.testing.assert_array_equal(several, watched(observations[:3], actions[:3]))
-    assert several[SEEN] == 3
+    seen = watched(broken[:4], actions[:4])
+    assert (seen[SEEN], seen[AGE]) == (3, 1)
+    np.testing.assert_array_equal(seen[QUICK:], watched(observations[:3], actions[:3])[QUICK:])
+    ramp = np.zeros((9, 20))
+    ramp[:, 3] = np.arange(9) * 0.2
+    broken = ramp.copy()
+    broken[[2, 5, 6], 0] = np.inf
+    jerk = QUICK + STATISTICS.index("jerk")
+    for drive in (ramp, broken):
+        assert watched(drive, ramp[:, 3:5])[jerk] == pytest.approx((0.2 / PERIOD) ** 2, rel=1e-5)
 
 
 def test_means_follow_at_their_time_constants() -> None:
