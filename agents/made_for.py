@@ -19,7 +19,7 @@ class MadeForTask(Protocol):
 
     @property
     def control_period(self) -> float:
-        """s."""
+        """Seconds between its actions."""
         ...
 
     @property
