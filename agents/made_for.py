@@ -19,7 +19,7 @@ class MadeForTask(Protocol):
 
     @property
     def control_period(self) -> float:
-        """S."""
+        """Seconds between its actions."""
         ...
 
     @property

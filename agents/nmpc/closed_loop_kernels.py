@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from agents.delay_kernels import look_ahead
 from agents.nmpc import rti
-from agents.nmpc.program import INNER
+from agents.nmpc.program import CODE, INNER, SUCCESS
 from agents.nmpc.switching import NO_BAND, choose_weights, update_band
 from agents.weight_tuning.deciding import reconsider
 from agents.weight_tuning.watching import FAILURES, FRESH, passed, watch
@@ -103,6 +103,33 @@ def attend_rows(
             )  # fmt: skip
 
 
+@compiled_internal
+def choose(
+    row: int, observations: Array, looked: Array, tables: Array, rules: Array, bands: Array,
+    weights: Array, watched: Array, network: Array, layers: Array, sets: Array, matrix: Array,
+    log_span: Any, catalogue: Array, scales: Array, window: int, scratch: Array, steps: int,
+) -> None:  # fmt: skip
+    """Bring a vehicle's `weights` in use up to date with what `attend` took in.
+
+    Where there are `layers`, a policy writes the vehicle's table first, if it is time.
+    """
+    own = row if tables.shape[0] > 1 else 0
+    if layers.shape[0] > 0:
+        reconsider(
+            observations[row], watched[row], weights[row], bands[row], network, layers, sets,
+            matrix, log_span, catalogue, scales, window, tables[own], scratch,
+        )  # fmt: skip
+    choose_weights(looked[row], steps, tables[own], rules, bands, row, weights[row])
+
+
+@compiled_internal
+def solved(watched: Array, told: Array) -> None:
+    """Note what a solve took, by what it `told`, and whether it failed."""
+    watched[ITERATED] += told[INNER]
+    if told[CODE] != SUCCESS:
+        watched[FAILURES] += 1.0
+
+
 @compiled
 def decide(
     row: int, asked: int, period: Any, observations: Array, looked: Array, commands: Array,
@@ -114,8 +141,7 @@ def decide(
 ) -> int:  # fmt: skip
     """Fill a vehicle's row of `actions`; HELD if its solve has failed, PAUSED at a band's end.
 
-    With `until_band`, `since` (n,) is the band in which the call found the vehicle. Where there are
-    `layers`, a policy writes the table of weights.
+    With `until_band`, `since` (n,) is the band in which the call found the vehicle.
     """
     if asked == ASKED:
         attend(
@@ -127,23 +153,19 @@ def decide(
                 since[row] = bands[row]
             if since[row] != bands[row]:
                 return PAUSED
-        own = row if tables.shape[0] > 1 else 0
-        if layers.shape[0] > 0:
-            reconsider(
-                observations[row], watched[row], weights[row], bands[row], network, layers, sets,
-                matrix, log_span, catalogue, scales, window, tables[own], scratch,
-            )  # fmt: skip
-        choose_weights(looked[row], lanes.shape[1], tables[own], rules, bands, row, weights[row])
+        choose(
+            row, observations, looked, tables, rules, bands, weights, watched, network, layers,
+            sets, matrix, log_span, catalogue, scales, window, scratch, lanes.shape[1],
+        )  # fmt: skip
         failed = rti.control(
             row, looked[row : row + 1], weights[row : row + 1], constants, plans, flags, told,
             states, actions, stages, lanes,
         )  # fmt: skip
         sums[ITERATIONS] += told[row, INNER]
         sums[SOLVES] += 1.0
-        watched[row, ITERATED] += told[row, INNER]
+        solved(watched[row], told[row])
         if failed > 0:
             sums[FAILED] += 1.0
-            watched[row, FAILURES] += 1.0
             return HELD
     if future.shape[0] > 0:
         remember(commands[row], actions[row, 0], actions[row, 1])

@@ -152,7 +152,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         # Of no rows: so it compiles here, if need be, and not within the first control period.
         memory, none = self._new(0), np.zeros((0, self._size))
         self.switching.choose(none, self.problem.horizon, memory.bands, memory.weights)
-        self._control(none, self.fixed_weights, memory)
+        self.solve_rows(none, self.fixed_weights, memory)
 
     def control(self, observation: TrackingObservation, memory: RtiRow) -> tuple[float, float]:
         """Inputs for one observation, those of `predict`; what it remembers is that row's."""
@@ -203,7 +203,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         else:
             weights = self.fixed_weights
         began = time.perf_counter()
-        failed = self._control(rows, weights, memory)
+        failed = self.solve_rows(rows, weights, memory)
         memory.seconds = time.perf_counter() - began
         if memory.ladders or failed:
             self.replace_failed(
@@ -212,8 +212,11 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         actions = memory.actions.astype(np.float32)
         return (actions[0] if np.ndim(observation) == 1 else actions), memory
 
-    def _control(self, rows: Array, weights: Array, memory: RtiMemory) -> int:
-        """Solve for every row; how many solves failed."""
+    def solve_rows(self, rows: Array, weights: Array, memory: RtiMemory) -> int:
+        """Solve for every row of observations (n, size), `weights` (n or 1, 10), into `memory`.
+
+        How many solves failed; their rows keep the action of the last step.
+        """
         stages, lanes = self._work
         arguments = (
             rows, weights, self.solver.constants, memory.plans, memory.flags, memory.told,

@@ -10,16 +10,14 @@ from numpy.typing import NDArray
 from agents.base import Action, DrivingTask, observation_rows
 from agents.delay import NearFuture, moved_plan
 from agents.made_for import check_task
-from agents.nmpc.closed_loop_kernels import ASKED, HELD, TALLY
-from agents.nmpc.layout import working_space
+from agents.nmpc import program
 from agents.nmpc.loop_memory import LoopMemory, LoopRow
 from agents.nmpc.rti_agent import RtiNmpc
 from agents.nmpc.rti_solver import DAMPING
-from agents.nmpc.switching import NO_BAND
 from agents.reference import NODE
 from agents.registry import CHECKPOINTS
 from agents.weight_tuning.deciding import NOBODY, Decider
-from agents.weight_tuning.deciding_rows import decide_rows
+from agents.weight_tuning.deciding_rows import finish_rows, prepare_rows
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.watching import REJECTED
 from agents.weights import TrackingWeights, WeightSchedule
@@ -55,7 +53,7 @@ class TunedNmpc:
         Whether the NMPC is shown the observation of the time at which its action lands, see
         `agents.delay`; by default where the task has delays. Errors and lags are watched in the
         observations as they come.
-    horizon, model, linear_penalty, quadratic_penalty, damping, tolerance, max_failures
+    horizon, model, linear_penalty, quadratic_penalty, damping, tolerance, max_failures, threads
         As in `RtiNmpc`.
 
     Raises
@@ -81,6 +79,7 @@ class TunedNmpc:
         damping: tuple[float, float] = DAMPING,
         tolerance: float = 1e-12,
         max_failures: int = 10,
+        threads: int = 1,
     ) -> None:
         self.task = task
         self.weights = _given(weights)
@@ -98,20 +97,16 @@ class TunedNmpc:
             damping=damping,
             tolerance=tolerance,
             max_failures=max_failures,
+            threads=threads,
         )
         delayed = task.delayed if delay_compensation is None else delay_compensation
         self.future = NearFuture(task, task.actuation, model) if delayed else None
         self._decider = (
             None if policy is None else Decider(policy.choice, policy.layers, task.control_period)
         )
-        steps, widest = task.layout.preview_steps, 1
-        if self._decider is not None:
-            widest = self._decider.widest
-        stages, lanes = working_space(self.nmpc.problem.horizon, 1)
-        self._work = (
-            np.zeros(TALLY), np.zeros((steps + 1, NODE)), np.zeros((2, widest), dtype=np.float32),
-            stages[0], lanes[0],
-        )  # fmt: skip
+        widest = 1 if self._decider is None else self._decider.widest
+        self._nodes = np.zeros((task.layout.preview_steps + 1, NODE))
+        self._scratch = np.zeros((2, widest), dtype=np.float32)
         self._memory: LoopMemory | None = None
         # Of no rows: so it compiles here, if need be, and not within the first control period.
         self._decide(np.zeros((0, task.layout.size), dtype=np.float32), self._new(0))
@@ -159,26 +154,27 @@ class TunedNmpc:
 
     def _decide(self, rows: NDArray[np.float32], memory: LoopMemory) -> None:
         """Fill `memory.nmpc.actions` for observations (n, size)."""
-        n, nmpc, solver = len(rows), memory.nmpc, self.nmpc.solver
+        nmpc = memory.nmpc
         if self._decider is None:
             tables, rules, choice = self.nmpc.switching.tables, self.nmpc.switching.rules, NOBODY
         else:
             tables, rules = memory.tables, self._decider.rules
             choice = self._decider.arguments
         future = np.zeros(0) if self.future is None else self.future.settings
-        asked = np.full(n, ASKED)
-        began = time.perf_counter()
-        failed = decide_rows(
-            self.task.control_period, rows, memory.looked, memory.commands, memory.feet, future,
-            tables, rules, nmpc.bands, nmpc.weights, memory.watched, False, np.full(n, NO_BAND),
-            *choice, solver.constants, nmpc.plans, nmpc.flags, nmpc.told, nmpc.states,
-            nmpc.actions, asked, *self._work,
+        arguments = (
+            rows, memory.looked, memory.commands, memory.feet, future, self._nodes, rules,
+            nmpc.bands, memory.watched, nmpc.actions, self.nmpc.problem.horizon,
+            self.task.control_period, tables, nmpc.weights, *choice, self._scratch,
         )  # fmt: skip
+        prepare_rows(*arguments)
+        began = time.perf_counter()
+        failed = self.nmpc.solve_rows(memory.looked, nmpc.weights, nmpc)
         nmpc.seconds = time.perf_counter() - began
         if nmpc.ladders or failed:
-            held = np.flatnonzero(asked == HELD)
-            self.nmpc.replace_failed(memory.looked, nmpc, held)
-            memory.send(held)
+            self.nmpc.replace_failed(
+                memory.looked, nmpc, np.flatnonzero(nmpc.told[:, program.CODE] != program.SUCCESS)
+            )
+        finish_rows(memory.watched, nmpc.told, memory.commands, nmpc.actions, future)
 
     def hold(self, memory: LoopMemory | None = None) -> None:
         """Let a control period pass in which nothing was computed: the last command stays."""

@@ -1,40 +1,44 @@
-"""Compiled: one control period of vehicles whose weights are chosen as they drive, for an agent."""
+"""Compiled: what `decide` does before and after a solve, for rows of vehicles: for an agent.
+
+The solve between them is the agent's own: linked in here it would be compiled all over again.
+"""
 
 from typing import Any
 
 from numpy.typing import NDArray
 
-from agents.nmpc.closed_loop_kernels import ASKED, HELD, decide, passed
+from agents.nmpc.closed_loop_kernels import attend, choose, passed, remember, solved
 from trajectories.compilation import compiled
 
 Array = NDArray[Any]
 
 
 @compiled
-def decide_rows(
-    period: Any, observations: Array, looked: Array, commands: Array, feet: Array, future: Array,
-    tables: Array, rules: Array, bands: Array, weights: Array, watched: Array, until_band: bool,
-    since: Array, network: Array, layers: Array, sets: Array, matrix: Array, log_span: Any,
-    catalogue: Array, scales: Array, window: int, constants: Array, plans: Array, flags: Array,
-    told: Array, states: Array, actions: Array, asked: Array, sums: Array, nodes: Array,
-    scratch: Array, stages: Array, lanes: Array,
-) -> int:  # fmt: skip
-    """What `drive_rows` does before it drives, a period for every row; how many solves failed.
-
-    Observations (n, size) float32; `asked` (n,) is HELD in the end where a solve has failed: that
-    row's action is to be replaced and sent. For the other arguments see `decide`.
-    """
-    failed = 0
+def prepare_rows(
+    observations: Array, looked: Array, commands: Array, feet: Array, future: Array, nodes: Array,
+    rules: Array, bands: Array, watched: Array, actions: Array, steps: int, period: Any,
+    tables: Array, weights: Array, network: Array, layers: Array, sets: Array, matrix: Array,
+    log_span: Any, catalogue: Array, scales: Array, window: int, scratch: Array,
+) -> None:  # fmt: skip
+    """Take in observations (n, size) float32 and bring `weights` (n, 10) in use up to date."""
     for row in range(observations.shape[0]):
-        # From the array and not as it stands here: then one compiled `decide` does for all.
-        asked[row] = ASKED
-        asked[row] = decide(
-            row, asked[row], period, observations, looked, commands, feet, future, tables, rules,
-            bands, weights, watched, until_band, since, network, layers, sets, matrix, log_span,
-            catalogue, scales, window, constants, plans, flags, told, states, actions, sums, nodes,
-            scratch, stages, lanes,
+        attend(
+            row, observations, looked, commands, feet, future, nodes, rules, bands, watched,
+            actions, steps, period,
         )  # fmt: skip
+        choose(
+            row, observations, looked, tables, rules, bands, weights, watched, network, layers,
+            sets, matrix, log_span, catalogue, scales, window, scratch, steps,
+        )  # fmt: skip
+
+
+@compiled
+def finish_rows(
+    watched: Array, told: Array, commands: Array, actions: Array, future: Array
+) -> None:
+    """Note what the solves took and the actions (n, 2) that are sent: a period has passed."""
+    for row in range(actions.shape[0]):
+        solved(watched[row], told[row])
+        if future.shape[0] > 0:
+            remember(commands[row], actions[row, 0], actions[row, 1])
         passed(watched[row])
-        if asked[row] == HELD:
-            failed += 1
-    return failed

@@ -15,7 +15,7 @@ from agents.nmpc.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning import features
 from agents.weight_tuning.choice import WeightChoice, weights_for_all
 from agents.weight_tuning.deciding import Decider
-from agents.weight_tuning.score import FAILED, failed, parts_of, scores_of
+from agents.weight_tuning.score import FAILED, failed, marginal_parts, parts_of, scores_of
 from agents.weight_tuning.spaces import action_space, checked_choices, observation_space
 from agents.weight_tuning.watching import CLOCK, FAILURES, ITERATIONS
 from lpv_track_env import kernels as k
@@ -203,7 +203,8 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
 
     def _rewards(self, tally: Tally, ended: Array) -> Array:
         share = tally.steps / self._decider.window
-        rewards: Array = 0.0 - parts_of(tally).sum(axis=1) * share
+        parts = marginal_parts(tally, Tally(*self._sums), self._decider.window)
+        rewards: Array = 0.0 - parts.sum(axis=1) * share
         rewards[ended & failed(self.drives.arrays.ends)] -= FAILED * END_WINDOWS
         return rewards
 
