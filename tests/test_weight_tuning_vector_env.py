@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
-from test_vector_env import assert_equal, step_both
 from tuned_drives import CALM, CHOICES, LIVELY, random_actions
+from vector_equality import assert_equal, step_both
 
 from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.env import WeightTuningEnv

@@ -116,30 +116,39 @@ class ByHand:
     def step(self, action: Any) -> int:
         """Drive a window; how many periods it had."""
         assert self.band is not None
-        period, slew = self.env.control_period, self.choice.slew
         if np.isfinite(action).all():
             self.table[self.band] = meant(self.choice, action, self.band)
-        most = max(round(self.choice.window / period), 1)
+        most = max(round(self.choice.window / self.env.control_period), 1)
         band, first = self.band, len(self.actions)
         while len(self.actions) - first < most:
-            target = self.table[band]
-            if self.used is not None:
-                factor = math.exp(slew * period) if math.isfinite(slew) else math.inf
-                target = np.minimum(np.maximum(target, self.used / factor), self.used * factor)
-            self.used = target.copy()
-            assert self.agent.set_weights(target)
-            command, memory = self.agent.predict(self.observations[-1])
-            self.iterations.append(self.agent.diagnostics(memory[0])["iterations"])
+            if self.env.controller_busy:
+                self.agent.hold()
+                command = self.actions[-1]
+            else:
+                command = self.solve(self.table[band])
             observation, _, terminated, truncated, info = self.env.step(command)
             self.observations.append(observation)
-            self.actions.append(np.asarray(command))
+            self.actions.append(command)
             self.truths.append(info)
             self.actuators.append(self.env.actuators)
             self.done = terminated or truncated
-            self.band = self.next_band()
+            # A busy computer sees nothing, but for who decides at the window's end.
+            if self.done or not self.env.controller_busy or len(self.actions) - first == most:
+                self.band = self.next_band()
             if self.done or self.band != band:
                 break
         return len(self.actions) - first
+
+    def solve(self, target: Array) -> Array:
+        """Command under weights that have moved towards a target."""
+        if self.used is not None:
+            factor = math.exp(self.choice.slew * self.env.control_period)
+            target = np.minimum(np.maximum(target, self.used / factor), self.used * factor)
+        self.used = target.copy()
+        assert self.agent.set_weights(target)
+        command, memory = self.agent.predict(self.observations[-1])
+        self.iterations.append(self.agent.diagnostics(memory[0])["iterations"])
+        return np.asarray(command)
 
     def parts(self, first: int, last: int) -> Array:
         """The score's parts over periods first to last - 1, by its definition."""
