@@ -54,7 +54,8 @@ class WeightTuningEnv(gymnasium.Env[NDArray[np.float32], Any]):
     ## Episode
 
     As in `PathTrackingEnv`: terminated at the path's end, off the road or turned around; truncated
-    at the time limit.
+    at the time limit. Where a computer misses its deadlines a window may end while it is busy: what
+    is chosen then holds from its next solve on.
 
     ## Infos
 

@@ -51,7 +51,8 @@ def pool_of(count: int, found: Sequence[TrackingWeights], seed: int = 0) -> Arra
     drawn = np.tile(base, (count, 1))
     drawn[:, :8] *= np.exp((limit * (2.0 * points - 1.0)) @ directions.T)
     given = np.array([one.as_array() for one in found]).reshape(-1, 10)
-    return np.clip(np.vstack([base, given, drawn]), LOWEST, HIGHEST)
+    pool: Array = np.clip(np.vstack([base, given, drawn]), LOWEST, HIGHEST)
+    return pool
 
 
 def loop_of(envs: PathTrackingVectorEnv) -> ClosedLoop:
