@@ -56,8 +56,8 @@ class Arm:
         """Its name in results."""
         if self.mode == CONTROL:
             return self.mode
-        span = "whole bounds" if self.span == WHOLE else f"span {self.span:g}"
-        return f"{self.mode}, {span}, {'no slew limit' if self.slew == math.inf else 'slew limit'}"
+        span = "whole" if self.span == WHOLE else f"{self.span:g}"
+        return f"{self.mode}, {span}, {'no limit' if self.slew == math.inf else 'slew limit'}"
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; None: no limit, and the whole bounds."""
@@ -120,7 +120,7 @@ class Setup:
     @property
     def windows(self) -> int:
         """Switches of a whole episode."""
-        return math.ceil(self.time_limit / WINDOW)
+        return math.ceil(self.time_limit / WINDOW - 1e-9)
 
 
 @dataclass

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich import box
 from rich.table import Table
 
 from agents.weight_tuning.score import failed
@@ -85,14 +86,14 @@ def table(result: Mapping[str, Any]) -> Table:
     """An arm a row."""
     setup = result["setup"]
     shown = Table(
-        title=f"weights switched every {result['window']:g} s, {setup['conditions']}, "
-        f"{setup['episodes']} episodes an arm",
-        title_justify="left",
-    )
-    shown.add_column("weights", no_wrap=True)
+        title=f"default weights, or Q and S switched every {result['window']:g} s within a span "
+        f"around them; {setup['conditions']}, {setup['episodes']} episodes a row",
+        title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False,
+    )  # fmt: skip
+    shown.add_column("weights, span", no_wrap=True)
     for heading in (
-        "lost", "rate below\n(95 %)", "failed\nsolves", "not\nfinite", "rms\nm",
-        "largest, m\nmedian", "\np99", "\nof all",
+        "lost", "rate <\n(95 %)", "failed\nsolves", "\nNaN", "rms\nm", "max |e_y|\nmedian",
+        "\np99", "\nmax",
     ):  # fmt: skip
         shown.add_column(heading, justify="right", no_wrap=True)
     for label, row in result["arms"].items():
@@ -111,7 +112,7 @@ def widest_kept(result: Mapping[str, Any]) -> str:
     for row in result["arms"].values():
         if row["mode"] != CONTROL:
             span = WHOLE if row["span"] is None else row["span"]
-            name = f"{row['mode']}, {'no slew limit' if row['slew'] is None else 'slew limit'}"
+            name = f"{row['mode']}, {'no limit' if row['slew'] is None else 'slew limit'}"
             spans.setdefault(name, []).append((span, row["lost"] > 0))
     words = []
     for name, rows in spans.items():
