@@ -140,6 +140,16 @@ def _realtime(options: argparse.Namespace, console: Any) -> int:
         return EXIT_INTERRUPTED
 
 
+def _switching(options: argparse.Namespace, console: Any) -> int:
+    from experiments.tuning.safety_command import run_switching
+
+    try:
+        return run_switching(options, console)
+    except KeyboardInterrupt:
+        console.print(f"interrupted: the same command goes on from {options.out}")
+        return EXIT_INTERRUPTED
+
+
 def conditions_of(options: argparse.Namespace) -> str | dict[str, Any]:
     """Conditions by name, or a dictionary of what departs from them."""
     from experiments.benchmark import parse_settings
@@ -232,6 +242,7 @@ RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "speed": _speed,
     "ablation": _realtime,
     "latency": _realtime,
+    "switching": _switching,
     "verify": _verify,
     "bag": _bag,
     "run-parallel": _run_parallel,

@@ -157,6 +157,33 @@ def _latency(add: Add) -> None:
     )
 
 
+def _switching(add: Add) -> None:
+    switching = add(
+        "switching",
+        "Switch the NMPC's weights at random and by an adversary: are vehicles lost?",
+        "lpv-track switching --episodes 2000 --spans 10 100 whole --out results/switching",
+    )
+    switching.add_argument(
+        "--episodes", type=int, default=2000, metavar="N", help="of each arm (default 2000)"
+    )
+    switching.add_argument(
+        "--spans", nargs="+", default=["10", "100", "1000", "whole"], metavar="FACTOR",
+        help="how far weights are drawn from the default ones (default 10 100 1000 whole: the "
+        "whole bounds of weights)",
+    )  # fmt: skip
+    switching.add_argument(
+        "--candidates", type=int, default=4, metavar="K",
+        help="draws in every window of which the adversary takes the worst (default 4)",
+    )  # fmt: skip
+    switching.add_argument("--conditions", default="realtime", metavar="NAME")
+    switching.add_argument("--vehicle", default="m2-minibus", metavar="NAME")
+    switching.add_argument("--seed", type=int, default=0)
+    switching.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="default 1; results do not depend on it"
+    )
+    switching.add_argument("--out", type=Path, default=Path("results/switching"), metavar="DIR")
+
+
 def _verify(add: Add) -> None:
     verify = add(
         "verify",
@@ -267,6 +294,7 @@ def parser() -> argparse.ArgumentParser:
         _speed,
         _ablation,
         _latency,
+        _switching,
         _verify,
         _bag,
         _run_parallel,

@@ -286,6 +286,8 @@ def test_copies_drive_as_their_originals() -> None:
     for original, image in ((0, 3), (1, 4), (0, 5)):
         np.testing.assert_array_equal(trace[image], trace[original])
         assert [values[image] for values in tally] == [values[original] for values in tally]
+    loop.copy([1, 1, 1], [4, 1, 5])
+    assert {1, 4, 5} <= set(loop.memory.nmpc.ladders)
     loop.copy([0], [2])
     _, trace = traced(
         loop, 10, np.array([WEIGHTS, WEIGHTS, 3.0 ** np.arange(10) * WEIGHTS, *weights[3:]])

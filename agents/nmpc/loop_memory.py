@@ -82,10 +82,14 @@ class LoopMemory:
             self.looked, self.commands, self.feet, self.watched, self.tables,
         ):  # fmt: skip
             array[onto] = array[rows]
-        for row, other in zip(rows.tolist(), onto.tolist(), strict=True):
+        # All at once, as the arrays: a row may be among those that it is copied onto.
+        pairs = list(zip(rows.tolist(), onto.tolist(), strict=True))
+        copied = {
+            other: copy.deepcopy(nmpc.ladders[row]) for row, other in pairs if row in nmpc.ladders
+        }
+        for _, other in pairs:
             nmpc.ladders.pop(other, None)
-            if row in nmpc.ladders:
-                nmpc.ladders[other] = copy.deepcopy(nmpc.ladders[row])
+        nmpc.ladders.update(copied)
 
 
 @dataclass(frozen=True)

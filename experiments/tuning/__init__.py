@@ -1,1 +1,1 @@
-"""`lpv-track tune` and its study: weights of the NMPC by tables, search, gradients and learning."""
+"""Weights of the NMPC by tables, search, gradients and learning; their study; safe switching."""

@@ -1,0 +1,116 @@
+"""`lpv-track switching`: whether switching weights loses vehicles."""
+
+import argparse
+import dataclasses
+import hashlib
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from agents.weights import HIGHEST, LOWEST, TrackingWeights
+from experiments.benchmark import progress_bar
+from experiments.cases import project_digest
+from experiments.results import hardware, revision, versions
+from experiments.tuning.safety import BATCH, WHOLE, WINDOW, Setup, arms_of, drive_arm
+from experiments.tuning.safety_summary import summary, table, widest_kept
+from lpv_track_env import conditions
+from lpv_track_env.threads import checked_threads
+from trajectories.atomic import write_atomically
+
+MOST_SPAN = 1e4
+
+
+def spans_of(given: list[str]) -> tuple[float, ...]:
+    """Spans as numbers; "whole" are the whole bounds of weights.
+
+    Raises
+    ------
+    ValueError
+        For anything else than a number above 1 and at most 10000.
+    """
+    spans = []
+    for text in given:
+        try:
+            span = WHOLE if text == "whole" else float(text)
+        except ValueError:
+            span = 0.0
+        if span != WHOLE and not 1.0 < span <= MOST_SPAN:
+            raise ValueError(
+                f"--spans are numbers above 1 and at most {MOST_SPAN:g}, or whole; not {text}"
+            )
+        spans.append(span)
+    return tuple(dict.fromkeys(spans))
+
+
+def run_switching(options: argparse.Namespace, console: Console) -> int:
+    """Drive every arm, print the table, write `switching.json`; arms that are there are kept.
+
+    Raises
+    ------
+    ValueError
+        For settings that are out of range or unknown.
+    """
+    setup = Setup(
+        episodes=options.episodes, conditions=options.conditions, vehicle=options.vehicle,
+        candidates=options.candidates, seed=options.seed, threads=checked_threads(options.threads),
+    )  # fmt: skip
+    conditions.load(setup.conditions)
+    arms = arms_of(spans_of(options.spans))
+    options.out.mkdir(parents=True, exist_ok=True)
+    file: Path = options.out / "switching.json"
+    plain = {key: value for key, value in dataclasses.asdict(setup).items() if key != "threads"}
+    result: dict[str, Any] = {
+        "experiment": "switching",
+        "setup": plain,
+        "window": WINDOW,
+        "bounds": [LOWEST, HIGHEST],
+        "default_weights": dataclasses.asdict(TrackingWeights()),
+        "trajectories": setup.trajectories,
+        "sources": _sources(),
+        "revision": revision(),
+        "versions": versions(),
+        "hardware": hardware(),
+    }
+    kept = _kept(file, result)
+    done: dict[str, Any] = {}
+    result["arms"] = done
+    batches = -(-setup.episodes // BATCH)
+    progress = progress_bar(console)
+    with progress:
+        for number, arm in enumerate(arms, start=1):
+            if arm.label not in kept:
+                bar = progress.add_task(arm.label, total=batches * setup.windows)
+                outcome = drive_arm(setup, arm, partial(progress.advance, bar))
+                kept[arm.label] = summary(outcome)
+            done[arm.label] = {**arm.as_dict(), **kept[arm.label]}
+            write_atomically(file, json.dumps(result, indent=1, allow_nan=False).encode())
+            if not console.is_terminal:
+                console.print(
+                    f"[{number}/{len(arms)}] {arm.label}: {done[arm.label]['lost']} lost",
+                    markup=False, highlight=False,
+                )  # fmt: skip
+    console.print(table(result))
+    console.print(widest_kept(result))
+    console.print(f"written: {file}", markup=False, highlight=False, soft_wrap=True)
+    return 0
+
+
+def _sources() -> str:
+    """Digest of what a result depends on."""
+    here = Path(__file__).parent
+    own = "".join((here / f"{name}.py").read_text() for name in ("safety", "safety_summary"))
+    return hashlib.sha256((project_digest() + own).encode()).hexdigest()[:16]
+
+
+def _kept(file: Path, result: dict[str, Any]) -> dict[str, Any]:
+    """Arms of a file that the same sources and settings wrote; none where there is no such."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        if all(content.get(key) == result[key] for key in ("experiment", "setup", "sources")):
+            return dict(content["arms"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        pass
+    return {}
