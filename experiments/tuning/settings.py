@@ -27,7 +27,7 @@ LEARNED = ("catalogue", "rl")
 
 PPO: dict[str, Any] = {
     "learning_rate": 3e-3, "last_learning_rate": 3e-4, "rollout": 16, "batch": 256, "epochs": 10,
-    "discount": 0.9, "gae_lambda": 0.9, "clip_range": 0.2, "deviation": 0.6, "hidden": [32, 32],
+    "discount": 0.9, "gae_lambda": 0.9, "clip_range": 0.2, "deviation": 1.0, "hidden": [32, 32],
     "segment": 50_000,
 }  # fmt: skip
 HYPERPARAMETERS: dict[str, dict[str, Any]] = {
