@@ -103,7 +103,6 @@ def test_killed_it_goes_on_bit_for_bit(method: str, tmp_path: Path) -> None:
     assert not (out / "weights.json").exists()
     assert 1 < len(lines.read_text().splitlines()) < steps
     resumed = tuned(method, out, "--resume", steps=steps)
-    assert not list(out.glob("*.tmp*"))
     whole = tuned(method, tmp_path / "whole", steps=steps)
     assert bits(resumed) == bits(whole)
     assert progress(resumed) == progress(whole)
