@@ -14,8 +14,8 @@ pytest.importorskip("cma")
 from weight_policies import random_weight_policy
 
 import agents
-import agents.weight_tuning.files
 from agents.weight_tuning.choice import WeightChoice
+from agents.weight_tuning.files import load
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import FAILED, PARTS
 from agents.weights import TrackingWeights, WeightSchedule
@@ -132,10 +132,12 @@ def test_a_judged_policy_drives_as_the_benchmarks_agent() -> None:
 
 
 def test_a_drive_that_fails_scores_as_one() -> None:
-    bad = TrackingWeights(Q=(1e6, 1e-4, 1e-4, 1e-4), S=(1e6, 1e-4, 1e-4, 1e-4), R=(1e-4, 1e6))
-    figures = judged(WeightSchedule(CurvatureBands(), (bad,) * 4), "simulation")
+    narrow = {"time_limit": 4.0, "max_lateral_error": 0.01}
+    given = EvaluationSet("narrow", ("circle", "figure-eight"), seeds=2, env_settings=narrow)
+    figures = Judge(given).judge(SCHEDULE)
     np.testing.assert_array_equal(figures["failed"], 1.0)
     np.testing.assert_array_equal(figures["score"], FAILED)
+    assert (figures["max_cte"] > 0.01).all()
 
 
 def test_evaluation_sets_are_of_paths_that_tuning_refuses() -> None:
@@ -157,7 +159,7 @@ def test_rungs_differ_in_what_they_say() -> None:
         assert (settings.method, settings.seed) == (one.method, 3)
         assert (settings.view, settings.conditions) == (one.view, one.conditions)
         assert settings.solves == 1000 * one.factor
-        assert ladder.rung(baseline_of(one).replace("'", "")).conditions == one.conditions
+        assert ladder.rung(baseline_of(one)).conditions == one.conditions
         assert ladder.rung(one.label) is one
     assert {one.factor for one in EVERY if BASELINE in one.label} == {10}
     assert ladder.rung(OURS).method in LEARNED
@@ -191,12 +193,10 @@ def fixture_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Study:
     }
     monkeypatch.setattr(study, "rung", short.__getitem__)
     monkeypatch.setattr(study, "local_pool", lambda specs, _, run, **__: map(run, specs))
-    sets = (
-        EvaluationSet(
-            "few, short", ("circle", "sine"), "simulation", 2, env_settings={"time_limit": 1.0}
-        ),
+    few = EvaluationSet(
+        "few, short", ("circle", "sine"), "simulation", 2, env_settings={"time_limit": 1.0}
     )
-    return Study(tmp_path, LABELS, (0, 1), 100, sets)
+    return Study(tmp_path, LABELS, (0, 1), 100, (few,))
 
 
 def times(folder: Path) -> dict[str, int]:
