@@ -119,7 +119,7 @@ def headroom(scores: Array, known: Array) -> list[Headroom]:
         found = _chosen(scores, group, every, every) / (paths * seeds)
         ahead = None
         # One seed leaves none to choose on, and a drive by itself none like it.
-        if seeds > 1 and group.max() + 1 < paths * seeds:
+        if seeds > 1 and len(np.unique(group)) < paths * seeds:
             ahead = (_chosen(scores, group, odd, ~odd) + _chosen(scores, group, ~odd, odd)) / (
                 paths * seeds
             )

@@ -56,13 +56,8 @@ def paired_gain(ours: Array, theirs: Array, *, seed: int = 0) -> Interval:
         return gains
 
     value = float(interquartile_mean(gain(a, b)))
-    random = np.random.default_rng(seed)
-    drawn = np.empty(RESAMPLES)
-    for k in range(RESAMPLES):
-        rows = random.integers(trainings, size=trainings)
-        columns = random.integers(paths, size=paths)
-        block = np.ix_(rows, columns)
-        drawn[k] = interquartile_mean(gain(a[block], b[block]))
+    blocks = _resampled(trainings, paths, seed)
+    drawn = interquartile_mean(gain(a[blocks], b[blocks]), axis=1)
     low, high = np.quantile(drawn, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2])
     return Interval(value, float(low), float(high))
 
@@ -71,15 +66,16 @@ def mean_interval(scores: Array, *, seed: int = 0) -> Interval:
     """Interquartile mean over trainings of mean scores (trainings, paths, drives), bootstrapped."""
     means = scores.mean(axis=2)
     trainings, paths = means.shape
-    random = np.random.default_rng(seed)
-    drawn = np.empty(RESAMPLES)
-    for k in range(RESAMPLES):
-        block = np.ix_(
-            random.integers(trainings, size=trainings), random.integers(paths, size=paths)
-        )
-        drawn[k] = interquartile_mean(means[block].mean(axis=1))
+    drawn = interquartile_mean(means[_resampled(trainings, paths, seed)].mean(axis=2), axis=1)
     low, high = np.quantile(drawn, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2])
     return Interval(float(interquartile_mean(means.mean(axis=1))), float(low), float(high))
+
+
+def _resampled(trainings: int, paths: int, seed: int) -> tuple[Array, Array]:
+    """Trainings (resamples, trainings, 1) and paths (resamples, 1, paths), with replacement."""
+    random = np.random.default_rng(seed)
+    rows = random.integers(trainings, size=(RESAMPLES, trainings, 1))
+    return rows, random.integers(paths, size=(RESAMPLES, 1, paths))
 
 
 def failure_bound(failures: int, drives: int) -> float:
