@@ -134,9 +134,9 @@ class WeightSchedule:
                 return self.weights[k].blended(self.weights[k + 1], share), chosen
         return self.weights[int(self.bands.classify(sharpest))], chosen
 
-    def write(self, file: Path) -> None:
-        """Write as JSON, atomically."""
-        content = {
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, as its file and the files of policies that start from it hold it."""
+        return {
             "format": FORMAT,
             "bands": dataclasses.asdict(self.bands),
             "weights": [dataclasses.asdict(weights) for weights in self.weights],
@@ -144,19 +144,17 @@ class WeightSchedule:
             "slew": self.slew,
             "provenance": dict(self.provenance),
         }
-        write_atomically(Path(file), json.dumps(content, indent=2).encode())
 
     @classmethod
-    def read(cls, file: Path) -> "WeightSchedule":
-        """Read what `write` wrote.
+    def from_dict(cls, content: Mapping[str, Any]) -> "WeightSchedule":
+        """Inverse of `as_dict`, also for what JSON makes of it.
 
         Raises
         ------
         ValueError
-            One line that names the file, if it cannot be read or is not such a schedule.
+            In one line, if it is not of that form.
         """
         try:
-            content = json.loads(Path(file).read_text(encoding="utf-8"))
             if content.get("format") not in (FORMAT, WITHOUT_SLEW):
                 raise ValueError(f"format is {content.get('format')!r}, not {FORMAT!r}")
             bands, slew = content["bands"], content.get("slew")
@@ -172,9 +170,25 @@ class WeightSchedule:
                 dict(content["provenance"]),
             )
         except KeyError as error:
-            raise ValueError(f"weight schedule {file}: no {error} in it") from error
-        except (
-            OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError,
-        ) as error:  # fmt: skip
+            raise ValueError(f"no {error} in it") from error
+        except (ValueError, TypeError, AttributeError, OverflowError) as error:
+            raise ValueError(" ".join(str(error).split())) from error
+
+    def write(self, file: Path) -> None:
+        """Write as JSON, atomically."""
+        write_atomically(Path(file), json.dumps(self.as_dict(), indent=2).encode())
+
+    @classmethod
+    def read(cls, file: Path) -> "WeightSchedule":
+        """Read what `write` wrote.
+
+        Raises
+        ------
+        ValueError
+            One line that names the file, if it cannot be read or is not such a schedule.
+        """
+        try:
+            return cls.from_dict(json.loads(Path(file).read_text(encoding="utf-8")))
+        except (OSError, ValueError, RecursionError) as error:
             reason = " ".join(str(error).split())
             raise ValueError(f"weight schedule {file}: {reason}") from error

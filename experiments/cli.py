@@ -222,6 +222,12 @@ def _train(options: argparse.Namespace, console: Any) -> int:
     return run_training(options, console)
 
 
+def _tune(options: argparse.Namespace, console: Any) -> int:
+    from experiments.tuning.command import run_tuning
+
+    return run_tuning(options, console)
+
+
 def _import_policy(options: argparse.Namespace, console: Any) -> int:
     from experiments.policy_import import run_import
 
@@ -241,6 +247,7 @@ RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "bag": _bag,
     "run-parallel": _run_parallel,
     "train": _train,
+    "tune": _tune,
     "import-policy": _import_policy,
 }
 """What runs each command."""

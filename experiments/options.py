@@ -8,6 +8,7 @@ from pathlib import Path
 from experiments.bags.arguments import add_bag_parsers
 from experiments.parallel.options import add_parallel_options
 from experiments.training.options import add_training_options
+from experiments.tuning.options import add_tuning_options
 
 Add = Callable[[str, str, str], argparse.ArgumentParser]
 """Makes the parser of a command from its name, what it does, and an example."""
@@ -231,6 +232,16 @@ def _train(add: Add) -> None:
     )
 
 
+def _tune(add: Add) -> None:
+    add_tuning_options(
+        add(
+            "tune",
+            "Tune the NMPC's weights Q and S, on random paths under randomised conditions.",
+            "lpv-track tune --method rl --seed 0 --out results/tune/rl",
+        )
+    )
+
+
 def _import_policy(add: Add) -> None:
     command = add(
         "import-policy",
@@ -288,6 +299,7 @@ def parser() -> argparse.ArgumentParser:
         _bag,
         _run_parallel,
         _train,
+        _tune,
         _import_policy,
     ):
         declare(add)

@@ -326,8 +326,22 @@ REALTIME = Conditions(
     computing_delay=(0.005, 0.02),
 )
 
+RANDOMISED = REALTIME.replace(
+    name="randomised",
+    gnss_noise=(0.01, 0.15),
+    steering_lag=(0.05, 0.2),
+    steering_dead_time=(0.0, 0.1),
+)
+"""`REALTIME` for vehicles that are known less: fixes from RTK to a metre-class receiver's, a quick
+servo to a slow one, no dead time to two periods of 0.05 s. What weights are tuned under."""
+
 SIMULATION = "simulation"
-PRESETS: dict[str, Conditions | None] = {SIMULATION: None, "realtime": REALTIME, "ideal": IDEAL}
+PRESETS: dict[str, Conditions | None] = {
+    SIMULATION: None,
+    "realtime": REALTIME,
+    "randomised": RANDOMISED,
+    "ideal": IDEAL,
+}
 """Conditions by name; None stands for the ideal kernels."""
 
 

@@ -101,10 +101,10 @@ class Policy:
         choose("activation", self.activation, ACTIVATIONS)
         choose("squash", self.squash, SQUASHES)
         choose("origin", self.origin, ORIGINS)
-        limit = _number("feature_limit", self.feature_limit)
+        limit = checked_number("feature_limit", self.feature_limit)
         if not limit > 0.0:
             raise ValueError(f"feature_limit must be positive, not {limit}")
-        period = checked_period(_number("control_period", self.control_period))
+        period = checked_period(checked_number("control_period", self.control_period))
         centre, half = (_action(name, getattr(self, name)) for name in ("centre", "half"))
         if half.min() < 0.0:
             raise ValueError(f"half must not be negative, but is {half.tolist()}")
@@ -202,7 +202,14 @@ def _check_symmetry(symmetric: object, centre: Array) -> None:
         raise ValueError(f"a symmetric policy steers about 0, not about {centre[1]} rad")
 
 
-def _number(name: str, value: Any) -> float:
+def checked_number(name: str, value: Any) -> float:
+    """Value as a float, if it is a number and finite.
+
+    Raises
+    ------
+    ValueError
+        Naming it, for anything else; True and False are no numbers.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ValueError(f"{name} must be a number, not {value!r}")  # noqa: TRY004
     try:

@@ -7,6 +7,7 @@ turns, under every kind of conditions, whatever n is and however many threads sh
 
 import math
 import operator
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -139,7 +140,10 @@ class ClosedLoop:
         self._filter_work = np.zeros((many, filtering.WORK))
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Array, dict[str, Any]]:
         """Begin episodes as the environments' own `reset` does; their NMPCs forget."""
         result = self.envs.reset(seed=seed, options=options)

@@ -11,7 +11,7 @@ from agents.nmpc import rti
 from agents.nmpc.program import CODE, INNER, SUCCESS
 from agents.nmpc.switching import NO_BAND, choose_weights, update_band
 from agents.weight_tuning.deciding import reconsider
-from agents.weight_tuning.watching import CLOCK, FAILURES, FRESH, watch
+from agents.weight_tuning.watching import FAILURES, FRESH, passed, watch
 from agents.weight_tuning.watching import ITERATIONS as ITERATED
 from lpv_track_env import conditions_layout
 from lpv_track_env import kernels as k
@@ -170,13 +170,6 @@ def decide(
     if future.shape[0] > 0:
         remember(commands[row], actions[row, 0], actions[row, 1])
     return ASKED
-
-
-@compiled_internal
-def passed(watched: Array) -> None:
-    """Note that a control period has passed."""
-    watched[FRESH] = 0.0
-    watched[CLOCK] += 1.0
 
 
 @compiled

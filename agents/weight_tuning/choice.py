@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.learned.policy import checked_number
 from agents.nmpc.switching import rules_of
 from agents.weight_tuning.features import TUNED
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
@@ -36,6 +37,9 @@ DIRECTIONS: Mapping[str, Array] = {
 """What the entries of an action multiply: speed, heading and position in Q and S alike; the three
 in Q, then the three in S; or each of the eight weights."""
 
+LONGEST_WINDOW = 1e9
+"""s: its control periods are counted in 64 bits."""
+
 
 @dataclass(frozen=True)
 class WeightChoice:
@@ -53,7 +57,7 @@ class WeightChoice:
     catalogue
         Sets to choose one of instead; an action is an index then.
     window
-        s between decisions; a change of band calls for one at once.
+        s between decisions, at most `LONGEST_WINDOW`; a change of band calls for one at once.
 
     Raises
     ------
@@ -69,15 +73,18 @@ class WeightChoice:
 
     def __post_init__(self) -> None:
         choose("directions", self.directions, tuple(DIRECTIONS))
-        if not 1.0 < self.span <= 1e4:
-            raise ValueError(f"span must be above 1 and at most 10000, not {self.span}")
-        if not 0.0 < self.window < math.inf:
-            raise ValueError(f"window must be positive, not {self.window} s")
+        span, window = (checked_number(name, getattr(self, name)) for name in ("span", "window"))
+        if not 1.0 < span <= 1e4:
+            raise ValueError(f"span must be above 1 and at most 10000, not {span}")
+        if not 0.0 < window <= LONGEST_WINDOW:
+            raise ValueError(f"window must be in (0, {LONGEST_WINDOW:g}] s, not {window}")
         if isinstance(self.base, TrackingWeights):
             bands = CurvatureBands()
             base = WeightSchedule(bands, (self.base,) * len(bands), slew=SLEW)
             object.__setattr__(self, "base", base)
-        object.__setattr__(self, "catalogue", tuple(self.catalogue))
+        normal = {"span": span, "window": window, "catalogue": tuple(self.catalogue)}
+        for name, value in normal.items():
+            object.__setattr__(self, name, value)
 
     @property
     def schedule(self) -> WeightSchedule:

@@ -1,15 +1,22 @@
 """What a weight policy is: a choice of weights and the network that chooses, numbers only."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.learned.policy import MOST_LAYERS, Layer, checked_layer, plain_json
+from agents.learned.policy import (
+    MOST_LAYERS,
+    Layer,
+    checked_layer,
+    checked_number,
+    plain_json,
+)
 from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.features import size
+from agents.weights import WeightSchedule
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.task import checked_period
 
@@ -30,7 +37,7 @@ class WeightPolicy:
     Parameters
     ----------
     choice
-        What may be chosen.
+        What may be chosen; its base is copied as JSON gives it back.
     layers
         (W (out, in), b (out,)) of each layer, float32.
     layout
@@ -45,7 +52,8 @@ class WeightPolicy:
     Raises
     ------
     ValueError
-        For layers that do not fit one another, the features or the choice, or are not finite.
+        For layers that do not fit one another, the features or the choice, or are not finite; a
+        period that is none; a base or a training that JSON does not hold.
     """
 
     choice: WeightChoice
@@ -71,6 +79,13 @@ class WeightPolicy:
                 f"the last layer must have {self.choice.entries} outputs, as the choice has "
                 f"entries, not {len(layers[-1][1])}"
             )
-        object.__setattr__(self, "layers", tuple(layers))
-        object.__setattr__(self, "control_period", checked_period(float(self.control_period)))
-        object.__setattr__(self, "training", plain_json("training", self.training))
+        base = WeightSchedule.from_dict(plain_json("choice.base", self.choice.schedule.as_dict()))
+        period = checked_number("control_period", self.control_period)
+        normal = {
+            "choice": replace(self.choice, base=base),
+            "layers": tuple(layers),
+            "control_period": checked_period(period),
+            "training": plain_json("training", self.training),
+        }
+        for name, value in normal.items():
+            object.__setattr__(self, name, value)

@@ -33,9 +33,15 @@ FAILURES = (k.LEFT_CORRIDOR, k.WRONG_HEADING, k.NON_FINITE)
 """Codes of ends that fail a drive."""
 
 
-def parts_of(tally: Tally) -> Array:
-    """The five parts of what was driven, (n, 5); 0 where nothing was."""
-    squares = np.stack(
+USUAL = np.array([0.05, 0.03, 0.1, 0.08, 0.8])
+"""Root mean squares of usual drives, m, rad, m/s, rad/s, m/s^3: what a drive's own begin from."""
+USUAL_WINDOWS = 5
+"""Windows of usual driving that a drive's own root mean squares are made with."""
+
+
+def squares_of(tally: Tally) -> Array:
+    """Sums of squares of the five, (n, 5), in their own units."""
+    return np.stack(
         [
             tally.lateral_square,
             tally.heading_square,
@@ -45,7 +51,36 @@ def parts_of(tally: Tally) -> Array:
         ],
         axis=1,
     )
-    parts: Array = np.sqrt(squares / np.maximum(tally.steps, 1.0)[:, None]) / SCALES
+
+
+def parts_of(tally: Tally) -> Array:
+    """The five parts of what was driven, (n, 5); 0 where nothing was."""
+    steps = np.maximum(tally.steps, 1.0)[:, None]
+    parts: Array = np.sqrt(squares_of(tally) / steps) / SCALES
+    return parts
+
+
+def marginal_parts(window: Tally, drive: Tally, periods: int) -> Array:
+    """What a window adds to the parts of its drive's score, (n, 5), a part to a usual window.
+
+    A root mean square is no sum over windows; to first order around the drive's own rms rho,
+
+        rms = mean over windows of (mean square / rho + rho) / 2
+
+    so that many windows' mean is the drive's part, and what makes it least is the same. rho is the
+    drive's so far, `drive` with this window, after `USUAL_WINDOWS` of usual driving.
+
+    Parameters
+    ----------
+    window, drive
+        What was driven in the window, and in the drive up to its end.
+    periods
+        Control periods of a whole window.
+    """
+    steps = np.maximum(window.steps, 1.0)[:, None]
+    before = float(USUAL_WINDOWS * periods)
+    rho = np.sqrt((before * USUAL**2 + squares_of(drive)) / (before + drive.steps[:, None]))
+    parts: Array = 0.5 * (squares_of(window) / steps / rho + rho) / SCALES
     return parts
 
 

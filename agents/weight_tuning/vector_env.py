@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -16,7 +15,8 @@ from agents.nmpc.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning import features
 from agents.weight_tuning.choice import WeightChoice, weights_for_all
 from agents.weight_tuning.deciding import Decider
-from agents.weight_tuning.score import FAILED, failed, parts_of, scores_of
+from agents.weight_tuning.score import FAILED, failed, marginal_parts, parts_of, scores_of
+from agents.weight_tuning.spaces import action_space, checked_choices, observation_space
 from agents.weight_tuning.watching import CLOCK, FAILURES, ITERATIONS
 from lpv_track_env import kernels as k
 from lpv_track_env.conditions import Conditions
@@ -41,14 +41,16 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
     and NMPC run in compiled code; see `WeightTuningEnv` for actions, observations and rewards.
     Environment i of `reset(seed=s)` is a single environment of `reset(seed=s + i)`.
 
-    ## Autoreset
+    ## Autoreset, infos
 
-    As in `PathTrackingVectorEnv`: `NEXT_STEP` (default), `SAME_STEP`, `DISABLED`.
+    As in `PathTrackingVectorEnv`: `NEXT_STEP` (default), `SAME_STEP`, `DISABLED`, and infos as
+    Gymnasium's `SyncVectorEnv` gathers them in each.
 
     ## Arguments
 
     Those of `WeightTuningEnv`, and `num_envs`, `autoreset_mode`, `threads`; `trajectory` and
-    `vehicle` may be sequences, of which every episode draws one each.
+    `vehicle` may be sequences, of which every episode draws one each. Every NMPC's model is the
+    first vehicle, whichever it drives.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  declared so by gymnasium
@@ -96,21 +98,25 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         self.num_envs = self.drives.num_envs
         self.render_mode = render_mode
         self.autoreset_mode = checked_mode(autoreset_mode)
-        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {
+            **self.metadata, "autoreset_mode": self.autoreset_mode,
+            "render_fps": max(round(1.0 / self.choice.window), 1),
+        }  # fmt: skip
         self.single_observation_space = observation_space(self.choice)
         self.single_action_space = action_space(self.choice)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         n = self.num_envs
         self._sums = np.zeros((len(Tally._fields), n))
+        self._solves = 0
         self._ended = np.zeros(n, dtype=np.bool_)
         self._rejected = np.zeros(n, dtype=np.int64)
         self._clipped = np.zeros(n, dtype=np.int64)
 
     @property
     def solves(self) -> int:
-        """Solves of the episodes since the last reset of each; see `Tally.solves`."""
-        return int(self._sums[-1].sum())
+        """Solves of all environments since they were made: the budget of whoever tunes."""
+        return self._solves
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Infos | None = None
@@ -121,9 +127,10 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         """
         mask = checked_mask((options or {}).get("reset_mask"), self.num_envs)
         seeds: Any = seed
+        self.loop.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})
+        # All is checked: from here on the last episodes are gone.
         if isinstance(seed, int):
             super().reset(seed=seed)
-        self.loop.reset(seed=seeds, options=options)
         self._begin(mask)
         return self._observe(), self._infos(mask)
 
@@ -136,6 +143,31 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
         """Drive on with the weights that are chosen, until the window or the band ends."""
+        self._check_order()
+        self._choose(checked_choices(actions, self.choice, self.num_envs))
+        begins = self._ended
+        tally = self.loop.drive(self._decider.window, self.loop.memory.tables, until_band=True)
+        ends = self.drives.arrays.ends
+        self._ended = ends != k.RUNNING
+        ended = self._ended & ~begins
+        # What is seen where an episode ends is what would be seen if it went on.
+        self.loop.attend(ended)
+        self._add(tally)
+        rewards = self._rewards(tally, ended)
+        truncated = ended & (ends == k.TIME_LIMIT)
+        infos: Infos = {}
+        again, told = begins, ended
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
+            infos = self._final(ended, tally)
+            again, told = ended, np.zeros_like(ended)
+            tally = Tally(*(np.array(tally) * ~again))
+        if self.autoreset_mode is not AutoresetMode.DISABLED and again.any():
+            self.loop.reset(options={"reset_mask": again})
+            self._begin(again)
+        infos.update(self._infos(np.ones_like(ended), tally, told))
+        return self._observe(), rewards, ended & ~truncated, truncated, infos
+
+    def _check_order(self) -> None:
         if not self.drives.begun:
             raise gymnasium.error.ResetNeeded("the episodes have not begun: call reset() first")
         if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
@@ -143,29 +175,6 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
                 f"the episode of environment {int(np.argmax(self._ended))} has ended: call "
                 "reset(options={'reset_mask': mask}) before step()"
             )
-        self._choose(checked_choices(actions, self.choice, self.num_envs))
-        begins = self._ended.copy()
-        tally = self.loop.drive(self._decider.window, self.loop.memory.tables, until_band=True)
-        ends = self.drives.arrays.ends
-        self._ended = ends != k.RUNNING
-        self._add(tally)
-        ended = self._ended & ~begins
-        rewards = self._rewards(tally, ended)
-        truncated = ended & (ends == k.TIME_LIMIT)
-        terminated = ended & ~truncated
-        infos = self._infos(~begins, tally)
-        if ended.any():
-            infos["end"] = np.where(ended, NAMES[ends], np.array(None))
-            infos["score"] = np.where(ended, scores_of(Tally(*self._sums), ends), 0.0)
-            infos["_end"] = infos["_score"] = ended
-        again = begins
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            infos.update(self._final(ended, infos))
-            again = ended
-        if self.autoreset_mode is not AutoresetMode.DISABLED and again.any():
-            self.loop.reset(options={"reset_mask": again})
-            self._begin(again)
-        return self._observe(), rewards, terminated, truncated, infos
 
     def _choose(self, actions: Array) -> None:
         """Write what actions (n, entries) mean into the tables of running vehicles."""
@@ -177,7 +186,8 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
             memory.tables, refused,
         )  # fmt: skip
         self._rejected += refused
-        self._clipped += running & (np.abs(actions) > 1.0).any(axis=1) & (p.catalogue.size == 0)
+        beyond = (np.abs(actions) > 1.0).any(axis=1)
+        self._clipped += running & beyond & ~refused
         decided = memory.watched[running]
         decided[:, [CLOCK, FAILURES, ITERATIONS]] = 0.0
         memory.watched[running] = decided
@@ -189,10 +199,12 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         peaks = np.maximum(self._sums[largest], values[largest])
         self._sums += values
         self._sums[largest] = peaks
+        self._solves += int(tally.solves.sum())
 
     def _rewards(self, tally: Tally, ended: Array) -> Array:
         share = tally.steps / self._decider.window
-        rewards: Array = -parts_of(tally).sum(axis=1) * share
+        parts = marginal_parts(tally, Tally(*self._sums), self._decider.window)
+        rewards: Array = 0.0 - parts.sum(axis=1) * share
         rewards[ended & failed(self.drives.arrays.ends)] -= FAILED * END_WINDOWS
         return rewards
 
@@ -206,33 +218,39 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         )  # fmt: skip
         return seen
 
-    def _infos(self, mask: Array, tally: Tally | None = None) -> Infos:
-        """Infos of the window that was driven, for the environments that `mask` (n,) marks."""
+    def _infos(self, mask: Array, tally: Tally | None = None, ended: Array | None = None) -> Infos:
+        """Infos of a window for the environments that `mask` (n,) marks, zeros for the others.
+
+        Those that `ended` (n,) marks have an `end` and a `score`, too.
+        """
         memory = self.loop.memory
-        parts = np.zeros((self.num_envs, 5)) if tally is None else parts_of(tally)
-        zero = np.zeros(self.num_envs)
+        driven = Tally(*np.zeros_like(self._sums)) if tally is None else tally
         infos: Infos = {
-            "parts": np.where(mask[:, None], parts, 0.0),
-            "steps": (zero if tally is None else tally.steps).astype(np.int64),
-            "solves": (zero if tally is None else tally.solves).astype(np.int64),
-            "failures": (zero if tally is None else tally.failures).astype(np.int64),
+            "parts": np.where(mask[:, None], parts_of(driven), 0.0),
+            "steps": np.where(mask, driven.steps, 0.0).astype(np.int64),
+            "solves": np.where(mask, driven.solves, 0.0).astype(np.int64),
+            "failures": np.where(mask, driven.failures, 0.0).astype(np.int64),
             "band": np.where(mask, memory.nmpc.bands, 0),
             "weights": np.where(mask[:, None], memory.nmpc.weights, 0.0),
             "rejected": np.where(mask, self._rejected, 0),
             "clipped": np.where(mask, self._clipped, 0),
         }
         infos.update({f"_{name}": mask for name in list(infos)})
+        if ended is not None and ended.any():
+            ends = self.drives.arrays.ends
+            infos["end"] = np.where(ended, NAMES[ends], np.array(None))
+            infos["score"] = np.where(ended, scores_of(Tally(*self._sums), ends), 0.0)
+            infos["_end"] = infos["_score"] = ended
         return infos
 
-    def _final(self, ended: Array, infos: Infos) -> Infos:
+    def _final(self, ended: Array, tally: Tally) -> Infos:
         """`final_obs` and `final_info` of the episodes that have `ended` (n,)."""
         observations, last = self._observe(), np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended).tolist():
             last[i] = observations[i]
-        named = [name for name in infos if not name.startswith("_")]
-        final = {name: infos[name] for name in named} | {f"_{name}": ended for name in named}
         return {
-            "final_obs": last, "_final_obs": ended, "final_info": final, "_final_info": ended,
+            "final_obs": last, "_final_obs": ended,
+            "final_info": self._infos(ended, tally, ended), "_final_info": ended,
         }  # fmt: skip
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
@@ -242,49 +260,3 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
     def close_extras(self, **_: Any) -> None:
         """Free what drawing took."""
         self.drives.close()
-
-
-def observation_space(choice: WeightChoice) -> spaces.Box:
-    """Space of the features that a choice is made on."""
-    shape = (features.size(len(choice.bands)),)
-    return spaces.Box(-features.LIMIT, features.LIMIT, shape, dtype=np.float32)
-
-
-def action_space(choice: WeightChoice) -> spaces.Box | spaces.Discrete[np.int64]:
-    """Space of the actions of a choice."""
-    if choice.catalogue:
-        return spaces.Discrete(len(choice.catalogue))
-    return spaces.Box(-1.0, 1.0, (choice.entries,), dtype=np.float32)
-
-
-def checked_choices(actions: Any, choice: WeightChoice, num_envs: int) -> Array:
-    """Actions as float64 (n, entries); of a catalogue, 1 for the set that is chosen.
-
-    Numbers that are not finite are let through: weights stay as they are then.
-
-    Raises
-    ------
-    ValueError
-        For a wrong shape or type, or an index that is not in the catalogue.
-    """
-    try:
-        given = np.asarray(actions)
-    except ValueError:
-        given = np.empty(0)
-    count = choice.entries
-    if not choice.catalogue:
-        if given.shape != (num_envs, count) or given.dtype.kind not in "fiu":
-            raise ValueError(
-                f"actions must be an array {(num_envs, count)} of numbers in [-1, 1], "
-                f"{choice.directions!r} log-multipliers, not {given.shape} of {given.dtype}"
-            )
-        return np.ascontiguousarray(given, dtype=np.float64)
-    if given.shape != (num_envs,) or given.dtype.kind not in "iu":
-        raise ValueError(
-            f"actions must be {num_envs} indices of a catalogue, not {given.shape} of {given.dtype}"
-        )
-    if not ((given >= 0) & (given < count)).all():
-        wrong = given[(given < 0) | (given >= count)][0]
-        raise ValueError(f"the catalogue has sets 0 to {count - 1}, not {wrong}")
-    chosen: Array = np.eye(count)[given]
-    return chosen

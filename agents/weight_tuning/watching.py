@@ -26,11 +26,13 @@ SHORT, LONG = 0.4, 4.0
 """Time constants, s."""
 
 # Of a vehicle's row, (WATCH,):
-FRESH, SEEN, CLOCK, DECIDED, FAILURES, ITERATIONS, REJECTED = range(7)
-"""Whether the observation at hand is in; periods seen; periods since the last decision; the band it
-was made in, or -1; failed solves and iterations since then; decisions that were no numbers."""
-LAST = 7
-"""Last lateral and heading error, vx, vy, r, reported a and delta, commanded a and delta;"""
+FRESH, SEEN, CLOCK, DECIDED, FAILURES, ITERATIONS, REJECTED, AGE = range(8)
+"""Whether the observation at hand is in; observations seen; periods since the last decision; the
+band it was made in, or -1; failed solves and iterations since then; decisions that were no numbers;
+periods since the last observation that was seen."""
+LAST = 8
+"""Last lateral and heading error, vx, vy, rate of the heading error, reported a and delta, and
+commanded a and delta;"""
 QUICK, SLOW = LAST + 9, LAST + 9 + COUNT
 """mean squares over the short and the long time."""
 WATCH = SLOW + COUNT
@@ -45,10 +47,19 @@ def mean_in(w: Array, j: int, value: Any, quick: Any, slow: Any) -> None:
 
 
 @compiled_internal
-def watch(w: Array, o: Array, a: Any, delta: Any, period: Any) -> None:
-    """Note an observation (size,), of the period after the command (a, delta).
+def passed(w: Array) -> None:
+    """Note that a control period has passed."""
+    w[FRESH] = 0.0
+    w[CLOCK] += 1.0
+    w[AGE] += 1.0
 
-    The first after zeros begins an episode. One that is not finite is passed over.
+
+@compiled_internal
+def watch(w: Array, o: Array, a: Any, delta: Any, period: Any) -> None:
+    """Note an observation (size,), of after the command (a, delta).
+
+    The first after zeros begins an episode. One that is not finite is passed over. A computer that
+    misses its deadline sees none in a period: changes are over the time since the last one.
     """
     w[FRESH] = 1.0
     total = 0.0
@@ -61,24 +72,27 @@ def watch(w: Array, o: Array, a: Any, delta: Any, period: Any) -> None:
     if w[SEEN] > 0.0:
         last, before = w[LAST], w[LAST + 1]
         moved = w[LAST + 2] * math.sin(before) + w[LAST + 3] * math.cos(before)
-        turned = w[LAST + 4] - o[PREVIEW_START] * w[LAST + 2]
+        time = period * max(w[AGE], 1.0)
         share = 1.0 / w[SEEN]
-        quick = max(1.0 - math.exp(-period / SHORT), share)
-        slow = max(1.0 - math.exp(-period / LONG), share)
+        quick = max(1.0 - math.exp(-time / SHORT), share)
+        slow = max(1.0 - math.exp(-time / LONG), share)
         mean_in(w, 0, lateral, quick, slow)
         mean_in(w, 1, heading, quick, slow)
         mean_in(w, 2, vx - o[7], quick, slow)
-        mean_in(w, 3, lateral - last - period * moved, quick, slow)
-        mean_in(w, 4, heading - before - period * turned, quick, slow)
+        mean_in(w, 3, lateral - last - time * moved, quick, slow)
+        mean_in(w, 4, heading - before - time * w[LAST + 4], quick, slow)
         mean_in(w, 5, delta - now_delta, quick, slow)
         mean_in(w, 6, a - now_a, quick, slow)
-        mean_in(w, 7, (now_delta - w[LAST + 6]) / period, quick, slow)
-        mean_in(w, 8, (now_a - w[LAST + 5]) / period, quick, slow)
-        mean_in(w, 9, (delta - w[LAST + 8]) / period, quick, slow)
+        mean_in(w, 7, (now_delta - w[LAST + 6]) / time, quick, slow)
+        mean_in(w, 8, (now_a - w[LAST + 5]) / time, quick, slow)
+        mean_in(w, 9, (delta - w[LAST + 8]) / time, quick, slow)
         w[LAST + 7], w[LAST + 8] = a, delta
     else:
         w[DECIDED] = -1.0
         w[LAST + 7], w[LAST + 8] = now_a, now_delta
     w[SEEN] += 1.0
-    w[LAST], w[LAST + 1], w[LAST + 2], w[LAST + 3], w[LAST + 4] = lateral, heading, vx, vy, r
+    w[AGE] = 0.0
+    w[LAST], w[LAST + 1], w[LAST + 2], w[LAST + 3] = lateral, heading, vx, vy
+    # The preview's first curvature is that of the period to come.
+    w[LAST + 4] = r - o[PREVIEW_START] * vx
     w[LAST + 5], w[LAST + 6] = now_a, now_delta

@@ -1,0 +1,174 @@
+"""Weight policies by PPO (Schulman et al. 2017; Stable-Baselines3), in segments that can resume.
+
+A segment is a function of networks, optimiser and counters, and of (seed, segment): everything that
+is random is seeded anew, all episodes begin anew. So a tuning that goes on from a checkpoint is the
+one that was not interrupted.
+"""
+
+import random
+from collections.abc import Mapping
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+
+from agents.weight_tuning.choice import SLEW, WeightChoice
+from agents.weight_tuning.learner import WeightLearnerVecEnv
+from agents.weight_tuning.policy import WeightPolicy
+from agents.weight_tuning.vector_env import WeightTuningVectorEnv
+from agents.weight_tuning.views import seen_in
+from agents.weights import TrackingWeights, WeightSchedule
+from experiments.training import checkpoint
+from experiments.training.seeds import TRAINING_EPISODES
+from experiments.tuning.drives import threads
+from experiments.tuning.settings import TuningSettings
+from experiments.tuning.tuner import Tuner
+from lpv_track_env import vehicle
+from trajectories import CurvatureBands, ReferencePath
+
+GRID = (1.0, 0.3, 0.1, 0.03, 0.01)
+"""Factors on the position weights of a catalogue's sets, for each of five on the heading's:"""
+HEADING = (0.1, 0.3, 1.0, 3.0, 10.0)
+
+
+def catalogue() -> tuple[TrackingWeights, ...]:
+    """25 sets around the default one, which is the first: less position, more or less heading."""
+    base = TrackingWeights().as_array()
+    sets: list[TrackingWeights] = []
+    for position, heading in product(GRID, sorted(HEADING, key=lambda x: abs(np.log(x)))):
+        weights = base.copy()
+        weights[[2, 3, 6, 7]] *= position
+        weights[[1, 5]] *= heading
+        # Speed matters to comfort only: a tenth, but in the default set.
+        weights[[0, 4]] *= 1.0 if not sets else 0.1
+        sets.append(TrackingWeights.from_array(weights))
+    return tuple(sets)
+
+
+def choice_of(settings: TuningSettings) -> WeightChoice:
+    """What a policy may choose."""
+    bands = CurvatureBands()
+    base = WeightSchedule(bands, (TrackingWeights(),) * len(bands), slew=SLEW)
+    sets = catalogue() if settings.method == "catalogue" else ()
+    return WeightChoice(
+        base, directions=settings.directions, span=settings.span, catalogue=sets,
+        window=settings.window,
+    )  # fmt: skip
+
+
+class PolicyLearning(Tuner):
+    """PPO on `WeightTuning-v0`, from the default weights on."""
+
+    def __init__(self, settings: TuningSettings, paths: list[ReferencePath]) -> None:
+        super().__init__(settings)
+        torch.set_num_threads(1)
+        self.choice = choice_of(settings)
+        self.hyper = settings.hyperparameters
+        envs = WeightTuningVectorEnv(
+            settings.drives, paths, vehicle.load(settings.vehicle), conditions=settings.conditions,
+            control_period=settings.control_period, choice=self.choice,
+            preview_steps=settings.preview_steps, preview_period=settings.preview_period,
+            time_limit=settings.time_limit, random_start=True, autoreset_mode="SameStep",
+            threads=threads(),
+        )  # fmt: skip
+        self.env = WeightLearnerVecEnv(envs, seen_in(settings.view, self.choice.bands.names))
+        self._before, self._segment = 0, 0
+        hyper = self.hyper
+        self.model = PPO(
+            "MlpPolicy", self.env, learning_rate=self._rate, n_steps=hyper["rollout"],
+            batch_size=hyper["batch"], n_epochs=hyper["epochs"], gamma=hyper["discount"],
+            gae_lambda=hyper["gae_lambda"], clip_range=hyper["clip_range"], seed=settings.seed,
+            device="cpu", policy_kwargs=self._network(),
+        )  # fmt: skip
+        if self.choice.catalogue:
+            # The default set, the first one, to begin with.
+            with torch.no_grad():
+                self.model.policy.action_net.bias[0] = 2.0  # type: ignore[operator]
+
+    def _network(self) -> dict[str, Any]:
+        network: dict[str, Any] = {
+            "net_arch": list(self.hyper["hidden"]), "activation_fn": torch.nn.Tanh,
+        }  # fmt: skip
+        if not self.choice.catalogue:
+            network["log_std_init"] = float(np.log(self.hyper["deviation"]))
+        return network
+
+    def _rate(self, _: float) -> float:
+        """Learning rate, linear in the solves."""
+        first, last = self.hyper["learning_rate"], self.hyper["last_learning_rate"]
+        share = min(self.solves / self.settings.solves, 1.0) if hasattr(self, "model") else 0.0
+        return float(first + share * (last - first))
+
+    @property
+    def rollout(self) -> int:
+        """Solves of a rollout at most."""
+        steps = round(self.settings.window / self.settings.control_period)
+        return int(self.settings.drives * self.hyper["rollout"] * max(steps, 1))
+
+    @property
+    def solves(self) -> int:
+        """NMPC solves so far."""
+        return self._before + self.env.solves
+
+    @property
+    def cost(self) -> int:
+        """Solves of a rollout at most."""
+        return self.rollout
+
+    def step(self) -> dict[str, float]:
+        """One segment: rollouts and updates until the next would exceed its solves."""
+        settings, number = self.settings, self._segment
+        seed = int(np.random.SeedSequence((settings.seed, number)).generate_state(1)[0])
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002  where SB3 draws from
+        torch.manual_seed(seed)
+        self.env.seed(TRAINING_EPISODES * (1 + settings.seed) + 1_000_000 * number)
+        self.model.set_env(self.env, force_reset=True)
+        end = min((number + 1) * self.hyper["segment"], settings.solves)
+        rewards: list[float] = []
+        # At least once, or a segment shorter than a rollout would learn nothing for ever.
+        while not rewards or self.solves + self.rollout <= end:
+            steps = settings.drives * self.hyper["rollout"]
+            self.model.learn(steps, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]
+            rewards.append(float(self.model.rollout_buffer.rewards.mean()))
+        self._segment += 1
+        return {"score": -float(np.mean(rewards)), "best": -float(np.max(rewards))}
+
+    def layers(self) -> list[tuple[Any, Any]]:
+        """Layers from features to outputs, (W, b)."""
+        policy: Any = self.model.policy
+        parts = [*policy.mlp_extractor.policy_net, policy.action_net]
+        return [
+            (part.weight.detach().numpy().copy(), part.bias.detach().numpy().copy())
+            for part in parts
+            if isinstance(part, torch.nn.Linear)
+        ]
+
+    def result(self, provenance: Mapping[str, Any]) -> WeightPolicy:
+        """The policy of the mean action, or of the likeliest set."""
+        return self.env.policy_of(self.layers(), self.settings.method, provenance)
+
+    def save(self, folder: Path) -> None:
+        """Write networks, optimiser, counters."""
+        checkpoint.write(
+            folder,
+            {
+                "parameters": self.model.get_parameters(), "solves": self.solves,
+                "segment": self._segment, "steps": int(self.model.num_timesteps),
+                "updates": int(self.model._n_updates),  # noqa: SLF001
+            },
+        )  # fmt: skip
+
+    def restore(self, folder: Path) -> None:
+        """Take up what `save` wrote."""
+        kept = checkpoint.read(folder)
+        if kept is None:
+            raise ValueError(f"{folder} has no checkpoint: remove it, and the tuning begins anew")
+        self.model.set_parameters(kept["parameters"], exact_match=True)
+        self._before = kept["solves"] - self.env.solves
+        self._segment = kept["segment"]
+        self.model.num_timesteps = kept["steps"]
+        self.model._n_updates = kept["updates"]  # noqa: SLF001

@@ -1,0 +1,167 @@
+"""Tables of weights by search: CMA-ES (Hansen and Ostermeier 2001; package `cma`), and gradients.
+
+What is searched are log-multipliers on the default Q and S. A search is resumed by playing it
+again with the scores that are known: it draws the same candidates.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cma
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.weight_tuning.choice import DIRECTIONS, SLEW
+from agents.weights import TrackingWeights, WeightSchedule
+from experiments.tuning.drives import TuningDrives, weights_at
+from experiments.tuning.settings import TuningSettings
+from experiments.tuning.tuner import Tuner
+from trajectories import CurvatureBands, ReferencePath
+from trajectories.atomic import write_atomically
+
+Array = NDArray[Any]
+
+STATE, FORMAT = "search.json", "lpv-track-search/1"
+
+
+class Search(Tuner):
+    """Generations of points, judged on drives; what they were judged is all there is to keep."""
+
+    rows: int
+    """Sets of weights in a point."""
+
+    def __init__(self, settings: TuningSettings, paths: list[ReferencePath]) -> None:
+        super().__init__(settings)
+        self.paths = paths
+        self.entries = DIRECTIONS[settings.directions].shape[1]
+        self.limit = math.log(settings.span)
+        self.judged: list[list[float]] = []
+        """Scores of every generation's candidates."""
+        self._solves = 0
+
+    @property
+    def solves(self) -> int:
+        """NMPC solves so far."""
+        return self._solves
+
+    def save(self, folder: Path) -> None:
+        """Write the scores so far."""
+        content = {"format": FORMAT, "judged": self.judged, "solves": self._solves}
+        write_atomically(folder / STATE, json.dumps(content).encode())
+
+    def restore(self, folder: Path) -> None:
+        """Play the scores of a folder again."""
+        file = folder / STATE
+        try:
+            content = json.loads(file.read_text())
+            if content["format"] != FORMAT:
+                raise ValueError(f"its format is {content['format']!r}, not {FORMAT!r}")
+            judged = [[float(score) for score in row] for row in content["judged"]]
+            solves = int(content["solves"])
+            for row in judged:
+                if len(row) != len(self.ask()):
+                    raise ValueError("its generations are of another size")
+                self.tell(row)
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise ValueError(
+                f"{file} cannot be used ({reason}): remove it, and the tuning begins anew"
+            ) from None
+        self.judged, self._solves = judged, solves
+
+    def ask(self) -> list[Array]:
+        """Candidates of the next generation, points (rows * entries,)."""
+        raise NotImplementedError
+
+    def tell(self, scores: Sequence[float]) -> None:
+        """Learn from the scores of what `ask` gave."""
+        raise NotImplementedError
+
+    def judge(self, points: list[Array], number: int) -> list[float]:
+        """Scores of a generation's points."""
+        raise NotImplementedError
+
+    @property
+    def point(self) -> Array:
+        """Best guess so far, (rows, entries)."""
+        raise NotImplementedError
+
+    def step(self) -> dict[str, float]:
+        """One generation."""
+        points = self.ask()
+        scores = self.judge(points, len(self.judged))
+        self.tell(scores)
+        self.judged.append(scores)
+        return {"score": float(np.median(scores)), "best": float(np.min(scores))}
+
+    def result(self, provenance: Mapping[str, Any]) -> WeightSchedule:
+        """A schedule: a set for every band, all the same where there is but one."""
+        bands = CurvatureBands()
+        sets = weights_at(self.point, self.settings)
+        rows = np.broadcast_to(sets, (len(bands), 10))
+        return WeightSchedule(
+            bands, tuple(TrackingWeights.from_array(row) for row in rows), slew=SLEW,
+            provenance=provenance,
+        )  # fmt: skip
+
+
+class CmaSearch(Search):
+    """CMA-ES on the mean score of a round of drives, a new round every generation.
+
+    `rows` 1 searches the best fixed set, one for each band a table. The result is the mean of the
+    distribution: the best candidate of a noisy round would be the luckiest.
+    """
+
+    def __init__(self, settings: TuningSettings, paths: list[ReferencePath], rows: int) -> None:
+        super().__init__(settings, paths)
+        self.rows = rows
+        self.drives = TuningDrives(settings, paths)
+        self._es = evolution(settings, rows * self.entries, settings.seed)
+
+    @property
+    def cost(self) -> int:
+        """Solves of a generation at most."""
+        return int(self._es.popsize) * self.drives.most
+
+    def ask(self) -> list[Array]:
+        """Draw candidates."""
+        self._asked = self._es.ask()
+        return [np.asarray(point) for point in self._asked]
+
+    def tell(self, scores: Sequence[float]) -> None:
+        """Update the distribution."""
+        self._es.tell(self._asked, list(scores))
+
+    def judge(self, points: list[Array], number: int) -> list[float]:
+        """Mean scores, all of the same drives."""
+        before = self.drives.solves
+        scores = []
+        for point in points:
+            table = weights_at(point.reshape(self.rows, self.entries), self.settings)
+            count = len(self.drives.bands)
+            tables = np.broadcast_to(table, (count, 10))[None]
+            scores.append(float(self.drives.scores(tables, number).mean()))
+        self._solves += self.drives.solves - before
+        return scores
+
+    @property
+    def point(self) -> Array:
+        """Mean of the distribution."""
+        mean: Array = np.asarray(self._es.result.xfavorite).reshape(self.rows, self.entries)
+        return mean
+
+
+def evolution(settings: TuningSettings, size: int, seed: int) -> Any:
+    """A CMA-ES of so many variables, from the default weights on, bounded by the span."""
+    limit = math.log(settings.span)
+    return cma.CMAEvolutionStrategy(
+        np.zeros(size), settings.hyperparameters["sigma"],
+        {
+            # 0 would mean a seed of the time.
+            "seed": seed + 1, "verbose": -9, "bounds": [-limit, limit], "verb_log": 0,
+            "tolfun": 0.0, "tolfunhist": 0.0, "tolx": 0.0,
+        },
+    )  # fmt: skip

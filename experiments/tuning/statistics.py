@@ -1,0 +1,97 @@
+"""Statistics of few trainings: interquartile means, bootstrap intervals, paired gains.
+
+Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice", NeurIPS 34,
+2021: aggregate by the interquartile mean, and say how sure it is by resampling what is random.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import beta, trim_mean
+
+Array = NDArray[Any]
+
+RESAMPLES = 10_000
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate and its interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def interquartile_mean(values: Array, axis: int = 0) -> Any:
+    """Mean of the middle half along an axis: a quarter of the values cut off at each end."""
+    return trim_mean(values, 0.25, axis=axis)
+
+
+def paired_gain(ours: Array, theirs: Array, *, seed: int = 0) -> Interval:
+    """Share by which our mean score is below theirs, over trainings and drives.
+
+    Each training's gain is 1 - mean(ours) / mean(theirs) on the same drives; the estimate is the
+    interquartile mean over trainings. The bootstrap draws trainings and paths, with replacement: a
+    path's drives belong together.
+
+    Parameters
+    ----------
+    ours, theirs
+        Scores, (trainings, paths, drives); training i of one is compared with training i of the
+        other, drive by drive.
+    seed
+        Of the resampling.
+    """
+    if ours.shape != theirs.shape or ours.ndim != 3:
+        raise ValueError(f"scores must be alike in shape, not {ours.shape} and {theirs.shape}")
+    a, b = ours.mean(axis=2), theirs.mean(axis=2)
+    trainings, paths = a.shape
+
+    def gain(a: Array, b: Array) -> Array:
+        gains: Array = 1.0 - a.mean(axis=-1) / b.mean(axis=-1)
+        return gains
+
+    value = float(interquartile_mean(gain(a, b)))
+    random = np.random.default_rng(seed)
+    drawn = np.empty(RESAMPLES)
+    for k in range(RESAMPLES):
+        rows = random.integers(trainings, size=trainings)
+        columns = random.integers(paths, size=paths)
+        block = np.ix_(rows, columns)
+        drawn[k] = interquartile_mean(gain(a[block], b[block]))
+    low, high = np.quantile(drawn, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2])
+    return Interval(value, float(low), float(high))
+
+
+def mean_interval(scores: Array, *, seed: int = 0) -> Interval:
+    """Interquartile mean over trainings of mean scores (trainings, paths, drives), bootstrapped."""
+    means = scores.mean(axis=2)
+    trainings, paths = means.shape
+    random = np.random.default_rng(seed)
+    drawn = np.empty(RESAMPLES)
+    for k in range(RESAMPLES):
+        block = np.ix_(
+            random.integers(trainings, size=trainings), random.integers(paths, size=paths)
+        )
+        drawn[k] = interquartile_mean(means[block].mean(axis=1))
+    low, high = np.quantile(drawn, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2])
+    return Interval(float(interquartile_mean(means.mean(axis=1))), float(low), float(high))
+
+
+def failure_bound(failures: int, drives: int) -> float:
+    """Clopper-Pearson upper bound (95 %, one-sided) on the rate of failures.
+
+    Raises
+    ------
+    ValueError
+        Unless 0 <= failures <= drives and there is a drive.
+    """
+    if not 0 <= failures <= drives or drives < 1:
+        raise ValueError(f"{failures} failures of {drives} drives make no rate")
+    if failures == drives:
+        return 1.0
+    return float(beta.ppf(CONFIDENCE, failures + 1, drives - failures))
