@@ -39,6 +39,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     return {
         "episodes": episodes,
         "lost": failures,
+        "lost_seeds": outcome.seeds[lost].tolist(),
         "lost_upper_bound": upper_bound(failures, episodes),
         "ends": dict(ends),
         "not_finite": int(outcome.not_finite.sum()),
