@@ -221,7 +221,10 @@ def test_the_widest_span_in_which_none_is_lost() -> None:
     said = widest_kept({"arms": rows})
     assert "random, no limit: span 100;" in said
     assert "random, slew limit: the whole bounds;" in said
-    assert said.endswith("adversary, no limit: no span")
+    assert "adversary, no limit: no span;" in said
+    assert said.endswith("in every way: no span")
+    del rows["worst"]
+    assert widest_kept({"arms": rows}).endswith("in every way: span 100")
 
 
 # The command ---------------------------------------------------------------------------------
