@@ -114,12 +114,12 @@ def widest_kept(result: Mapping[str, Any]) -> str:
         if row["mode"] != CONTROL:
             span = WHOLE if row["span"] is None else row["span"]
             name = f"{row['mode']}, {'no limit' if row['slew'] is None else 'slew limit'}"
-            for way in (name, "in every way"):
-                spans.setdefault(way, []).append((span, row["lost"] > 0))
+            spans.setdefault(name, []).append((span, row["lost"] > 0))
+    spans["in every way"] = [row for rows in spans.values() for row in rows]
     words = []
     for name, rows in spans.items():
         lossy = [span for span, lost in rows if lost]
         widest = max((span for span, _ in rows if not lossy or span < min(lossy)), default=None)
         said = "no span" if widest is None else f"span {widest:g}"
         words.append(f"{name}: {'the whole bounds' if widest == WHOLE else said}")
-    return "none lost within: " + "; ".join(sorted(words, key=lambda word: word[:8] == "in every"))
+    return "none lost within: " + "; ".join(words)
