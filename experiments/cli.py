@@ -228,6 +228,12 @@ def _tune(options: argparse.Namespace, console: Any) -> int:
     return run_tuning(options, console)
 
 
+def _tuning_study(options: argparse.Namespace, console: Any) -> int:
+    from experiments.tuning.study_command import run_study
+
+    return run_study(options, console)
+
+
 def _import_policy(options: argparse.Namespace, console: Any) -> int:
     from experiments.policy_import import run_import
 
@@ -248,6 +254,7 @@ RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "run-parallel": _run_parallel,
     "train": _train,
     "tune": _tune,
+    "tuning-study": _tuning_study,
     "import-policy": _import_policy,
 }
 """What runs each command."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from experiments.bags.arguments import add_bag_parsers
 from experiments.parallel.options import add_parallel_options
 from experiments.training.options import add_training_options
-from experiments.tuning.options import add_tuning_options
+from experiments.tuning.options import add_study_options, add_tuning_options
 
 Add = Callable[[str, str, str], argparse.ArgumentParser]
 """Makes the parser of a command from its name, what it does, and an example."""
@@ -242,6 +242,16 @@ def _tune(add: Add) -> None:
     )
 
 
+def _tuning_study(add: Add) -> None:
+    add_study_options(
+        add(
+            "tuning-study",
+            "Compare the ways to weights: the whole ladder, held-out paths, oracles, one report.",
+            "lpv-track tuning-study --seeds 10 --out results/tuning-study",
+        )
+    )
+
+
 def _import_policy(add: Add) -> None:
     command = add(
         "import-policy",
@@ -300,6 +310,7 @@ def parser() -> argparse.ArgumentParser:
         _run_parallel,
         _train,
         _tune,
+        _tuning_study,
         _import_policy,
     ):
         declare(add)

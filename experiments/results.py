@@ -26,7 +26,8 @@ from trajectories.atomic import write_atomically
 
 PACKAGES = ("lpv-track-env", "numpy", "scipy", "numba", "casadi", "gymnasium")
 OPTIONAL_PACKAGES = (
-    "torch", "stable-baselines3", "highway-env", "piqp", "rosbags", "commonroad-vehicle-models",
+    "torch", "stable-baselines3", "highway-env", "cma", "piqp", "rosbags",
+    "commonroad-vehicle-models",
 )  # fmt: skip
 
 Array = NDArray[np.float64]

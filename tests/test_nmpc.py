@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -441,6 +442,20 @@ def test_schedule_by_band_and_by_path(nmpc: tuple[gymnasium.Env, Any]) -> None:
         _, memory = by_band.predict(observation, episode_start=np.array([True]))
         bands.add(int(memory.bands[0] if hasattr(memory, "bands") else memory[0].band[0]))
     assert bands == {0, 3}
+
+
+def test_a_schedules_file_is_the_schedule(nmpc: tuple[gymnasium.Env, Any], tmp_path: Path) -> None:
+    env, made = nmpc
+    cls, task = type(made), DrivingTask.of(env)
+    sets = tuple(TrackingWeights(Q=(1.0, 1.0, scale, scale)) for scale in (1.0, 2.0, 4.0, 8.0))
+    WeightSchedule(CurvatureBands(), sets).write(file := tmp_path / "mine.json")
+    by_file = cls(task, weights=str(file))
+    assert by_file.has_schedule
+    np.testing.assert_array_equal(by_file.switching.tables[0], [one.as_array() for one in sets])
+    with pytest.raises(ValueError, match=r"weight schedule .*nowhere"):
+        cls(task, weights=tmp_path / "nowhere.json")
+    with pytest.raises(ValueError, match="weights must be weights, a schedule or its file, not"):
+        cls(task, weights={"Q": 1})
 
 
 @functools.cache

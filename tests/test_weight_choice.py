@@ -78,7 +78,7 @@ def test_a_catalogue_is_chosen_from_by_the_largest() -> None:
     np.testing.assert_array_equal(chosen(choice, [-5.0, 80.0, 3.0]), CATALOGUE[1].as_array())
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.sampled_from(list(CHOICES)), st.lists(st.floats(width=64), min_size=8, max_size=8),
     st.integers(-1, 2), st.floats(1.01, 1e4),

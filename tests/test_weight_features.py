@@ -158,7 +158,7 @@ number = st.floats(width=32) | st.floats(-1.0, 1.0, width=32)
 rows = st.lists(number, min_size=14, max_size=14)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     st.lists(rows, min_size=1, max_size=5),
     st.lists(st.tuples(number, number), min_size=5, max_size=5),

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
-from test_vector_env import assert_equal, step_both
 from tuned_drives import CALM, CHOICES, LIVELY, random_actions
+from vector_equality import assert_equal, step_both
 
 from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.env import WeightTuningEnv
@@ -37,7 +37,7 @@ def sync(n: int, mode: AutoresetMode, **settings: Any) -> SyncVectorEnv:
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("conditions", ["simulation", "realtime"])
-@pytest.mark.parametrize("n", [1, 3, 13])
+@pytest.mark.parametrize("n", [1, 7])
 def test_equals_gymnasiums_own(n: int, conditions: str, mode: AutoresetMode) -> None:
     """Also over the episodes that follow; infos, masks and dtypes too."""
     settings = {"conditions": conditions, "choice": CHOICES["stages"]}
@@ -47,7 +47,7 @@ def test_equals_gymnasiums_own(n: int, conditions: str, mode: AutoresetMode) -> 
     for one, other in zip(ours.reset(seed=5), theirs.reset(seed=5), strict=True):
         assert_equal(one, other)
     ends: list[Any] = []
-    for action in random_actions(CHOICES["stages"], 40, n):
+    for action in random_actions(CHOICES["stages"], 30, n):
         if n > 1:
             action[0, 0] = np.nan
         *_, infos = step_both(ours, theirs, action, mode)

@@ -1,6 +1,7 @@
 """The LPV-NMPC as an agent, solved to convergence: the reference for what is fast."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -124,7 +125,7 @@ class IpoptNmpc(SolvedNmpc):
     horizon
         N, at most the observation's preview steps (the default).
     weights
-        Fixed weights, or a schedule.
+        Fixed weights, or a schedule, or the file of one.
     selection
         How a schedule chooses: "band" from the sharpest curvature in the preview at every step, or
         "path" once from the path's sharpest curvature, the paper's rule.
@@ -153,7 +154,7 @@ class IpoptNmpc(SolvedNmpc):
         task: DrivingTask,
         *,
         horizon: int | None = None,
-        weights: TrackingWeights | WeightSchedule | None = None,
+        weights: TrackingWeights | WeightSchedule | str | Path | None = None,
         selection: str = "band",
         model: VehicleParameters | None = None,
         linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),

@@ -3,6 +3,7 @@
 from abc import ABC
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -41,7 +42,7 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
         task: DrivingTask,
         *,
         horizon: int | None,
-        weights: TrackingWeights | WeightSchedule | None,
+        weights: TrackingWeights | WeightSchedule | str | Path | None,
         selection: str,
         model: VehicleParameters | None,
         linear_penalty: tuple[float, float, float],
@@ -69,6 +70,12 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
         self.max_failures = max_failures
         self._fallback = Stanley(task)
         self.rejected_weights = 0
+        if isinstance(weights, str | Path):
+            weights = WeightSchedule.read(Path(weights))
+        if not isinstance(weights, TrackingWeights | WeightSchedule | None):
+            raise ValueError(  # noqa: TRY004  a setting, as every other
+                f"weights must be weights, a schedule or its file, not {type(weights).__name__}"
+            )
         if isinstance(weights, WeightSchedule) and selection == "path":
             weights = weights.for_path(task.path)
         self.switching = Switching(weights or TrackingWeights(), task.control_period)

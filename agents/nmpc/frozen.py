@@ -9,6 +9,7 @@ travel, puts such a column into the very same field, and the program steers.
 """
 
 import time
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,7 +142,7 @@ class FrozenLpvMpc(SolvedNmpc):
         *,
         form: str = "literal",
         horizon: int | None = None,
-        weights: TrackingWeights | WeightSchedule | None = None,
+        weights: TrackingWeights | WeightSchedule | str | Path | None = None,
         selection: str = "band",
         model: VehicleParameters | None = None,
         linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),

@@ -3,6 +3,7 @@
 import copy
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -91,7 +92,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
     horizon
         N, at most the observation's preview steps (the default).
     weights
-        Fixed weights, or a schedule.
+        Fixed weights, or a schedule, or the file of one.
     selection
         How a schedule chooses: "band" from the sharpest curvature in the preview at every step, or
         "path" once from the path's sharpest curvature, the paper's rule.
@@ -122,7 +123,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         task: DrivingTask,
         *,
         horizon: int | None = None,
-        weights: TrackingWeights | WeightSchedule | None = None,
+        weights: TrackingWeights | WeightSchedule | str | Path | None = None,
         selection: str = "band",
         model: VehicleParameters | None = None,
         linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),

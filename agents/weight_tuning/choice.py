@@ -48,16 +48,17 @@ class WeightChoice:
     Parameters
     ----------
     base
-        Weights that are multiplied, a set a band; its slew limit holds for every change. One set
-        stands for all bands.
+        Weights that are multiplied, a set a band; its slew limit holds for every change, its
+        blending for none. One set stands for all bands, with `SLEW` for a limit.
     directions
         "joint", "stages" or "all", see `DIRECTIONS`.
     span
         An action of 1 multiplies by it, one of -1 divides.
     catalogue
-        Sets to choose one of instead; an action is an index then.
+        Sets to choose one of instead, R too; an action is an index then.
     window
-        s between decisions, at most `LONGEST_WINDOW`; a change of band calls for one at once.
+        s between decisions, in whole control periods, at most `LONGEST_WINDOW`; a change of band
+        calls for one at once.
 
     Raises
     ------

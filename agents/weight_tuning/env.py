@@ -46,15 +46,17 @@ class WeightTuningEnv(gymnasium.Env[NDArray[np.float32], Any]):
 
     ## Reward
 
-    Minus the parts of the score (`agents.weight_tuning.score`) over the window, times its share of
-    a whole window; of the truth. A drive that fails ends with minus 250 besides: ten windows of the
-    worst. A window of a good drive costs 1 to 2 under "realtime", so that is dearer than to drive
-    on for discount factors up to 0.99, and not for those close to 1 on a long path.
+    Minus what the window adds to its drive's score, to first order (`marginal_parts` of
+    `agents.weight_tuning.score`), times its share of a whole window; of the truth. A drive that
+    fails ends with minus 250 besides: ten windows of the worst. A window of a good drive costs 1 to
+    3 under "realtime", so that is dearer than to drive on for discount factors up to 0.99, and not
+    for those close to 1 on a long path.
 
     ## Episode
 
     As in `PathTrackingEnv`: terminated at the path's end, off the road or turned around; truncated
-    at the time limit.
+    at the time limit. Where a computer misses its deadlines a window may end while it is busy: what
+    is chosen then holds from its next solve on.
 
     ## Infos
 

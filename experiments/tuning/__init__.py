@@ -1,4 +1,1 @@
-"""`lpv-track tune` and its study: weights of the NMPC by tables, search, gradients and learning.
-
-`safety` is `lpv-track switching`: whether vehicles are lost when weights are switched.
-"""
+"""Weights of the NMPC by tables, search, gradients and learning; their study; safe switching."""

@@ -1,7 +1,7 @@
 """The paper's rule (kumar2025lpv): a set for each class of path, by the path's sharpest curvature.
 
 The published table of sets is not known; here each class's set is searched on the paths of that
-class, with a share of the budget as large as its share of the paths.
+class, with a share of the budget as large as its share of the paths searched.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ import numpy as np
 from agents.weight_tuning.choice import SLEW
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments.tuning.drives import weights_at
-from experiments.tuning.search import CmaSearch
+from experiments.tuning.search import CmaSearch, restore_state, write_state
 from experiments.tuning.settings import TuningSettings
 from experiments.tuning.tuner import Tuner
 from trajectories import CurvatureBands, ReferencePath
@@ -23,18 +23,32 @@ from trajectories import CurvatureBands, ReferencePath
 class PathClassSearch(Tuner):
     """A search for each class of path that there is; the result is to be followed by "path".
 
-    Classes without a path take the set of the nearest that has one.
+    Classes without a path, or with so few that their share of the budget allows no generation, take
+    the set of the nearest that is searched.
     """
 
     def __init__(self, settings: TuningSettings, paths: list[ReferencePath]) -> None:
         super().__init__(settings)
         self.bands = CurvatureBands()
         classes = [self.bands.select(path.curvature) for path in paths]
-        self.searches: dict[int, CmaSearch] = {}
-        for band in sorted(set(classes)):
-            own = [path for path, of in zip(paths, classes, strict=True) if of == band]
-            share = int(settings.solves * len(own) / len(paths))
-            self.searches[band] = CmaSearch(replace(settings, solves=share), own, 1)
+        self.searches = {
+            band: CmaSearch(
+                settings, [p for p, of in zip(paths, classes, strict=True) if of == band], 1
+            )
+            for band in sorted(set(classes))
+        }
+        self._share_out()
+        # The smallest leaves first: what it had may be what another one lacks.
+        while len(self.searches) > 1 and any(search.done for search in self.searches.values()):
+            del self.searches[min(self.searches, key=lambda b: len(self.searches[b].paths))]
+            self._share_out()
+
+    def _share_out(self) -> None:
+        """Give every search its share of the budget."""
+        count = sum(len(search.paths) for search in self.searches.values())
+        for search in self.searches.values():
+            share = self.settings.solves * len(search.paths) // count
+            search.settings = replace(self.settings, solves=max(share, 1))
 
     @property
     def solves(self) -> int:
@@ -57,15 +71,20 @@ class PathClassSearch(Tuner):
         return {key: float(np.mean([each[key] for each in figures])) for key in figures[0]}
 
     def save(self, folder: Path) -> None:
-        """Write every class's scores."""
-        for band, search in self.searches.items():
-            (folder / self.bands.names[band]).mkdir(exist_ok=True)
-            search.save(folder / self.bands.names[band])
+        """Write every class's scores, all at once."""
+        write_state(
+            folder,
+            {self.bands.names[band]: search.played for band, search in self.searches.items()},
+        )
 
-    def restore(self, folder: Path) -> None:
-        """Play every class's scores again."""
-        for band, search in self.searches.items():
-            search.restore(folder / self.bands.names[band])
+    def restore(self, folder: Path) -> bool:
+        """Play every class's scores again; False where there are none."""
+
+        def play(content: Mapping[str, Any]) -> None:
+            for band, search in self.searches.items():
+                search.play(content[self.bands.names[band]])
+
+        return restore_state(folder, play)
 
     def result(self, provenance: Mapping[str, Any]) -> WeightSchedule:
         """A set for each class."""

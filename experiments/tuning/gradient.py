@@ -58,13 +58,18 @@ class GradientSearch(Search):
         self._solves += self.drives.solves - before
         return [float(score) for score in scores]
 
+    def gradient(self, scores: Sequence[float]) -> Array:
+        """Gradient by log-multipliers, (rows * entries,), from the scores of what `ask` gave."""
+        values = np.asarray(scores).reshape(self.pairs, 2)
+        slopes = (values[:, 0] - values[:, 1]) / (2.0 * self.settings.hyperparameters["sigma"])
+        # A drive that fails says that a side is bad, not how steep it is.
+        gradient: Array = np.clip(slopes, -2.0, 2.0) @ self._directions / self.pairs
+        return gradient
+
     def tell(self, scores: Sequence[float]) -> None:
         """Take a step down the gradient."""
         hyper = self.settings.hyperparameters
-        values = np.asarray(scores).reshape(self.pairs, 2)
-        # A drive that fails says that a side is bad, not how steep it is.
-        slopes = np.clip((values[:, 0] - values[:, 1]) / (2.0 * hyper["sigma"]), -2.0, 2.0)
-        gradient = slopes @ self._directions / self.pairs
+        gradient = self.gradient(scores)
         steps = len(self._past) + 1
         self._mean += 0.1 * (gradient - self._mean)
         self._square += 0.01 * (gradient**2 - self._square)

@@ -162,13 +162,22 @@ class PolicyLearning(Tuner):
             },
         )  # fmt: skip
 
-    def restore(self, folder: Path) -> None:
-        """Take up what `save` wrote."""
+    def restore(self, folder: Path) -> bool:
+        """Take up what `save` wrote; False where there is nothing of it."""
         kept = checkpoint.read(folder)
         if kept is None:
-            raise ValueError(f"{folder} has no checkpoint: remove it, and the tuning begins anew")
-        self.model.set_parameters(kept["parameters"], exact_match=True)
-        self._before = kept["solves"] - self.env.solves
-        self._segment = kept["segment"]
-        self.model.num_timesteps = kept["steps"]
-        self.model._n_updates = kept["updates"]  # noqa: SLF001
+            return False
+        try:
+            self.model.set_parameters(kept["parameters"], exact_match=True)
+            self._before = int(kept["solves"]) - self.env.solves
+            self._segment = int(kept["segment"])
+            self.model.num_timesteps = int(kept["steps"])
+            self.model._n_updates = int(kept["updates"])  # noqa: SLF001
+        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+            # PyTorch tells of every layer that does not fit, a line each.
+            reason = str(error).split("\n", 1)[0]
+            raise ValueError(
+                f"{folder / checkpoint.NAME} is of another training ({reason}): remove it, and the "
+                "tuning begins anew"
+            ) from None
+        return True

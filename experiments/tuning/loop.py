@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from agents.weight_tuning.files import write as write_policy
-
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments.interrupts import Interrupts
 from experiments.results import hardware, revision, versions
@@ -89,11 +88,8 @@ def _tune(
         return _default(settings, folder, command)
     tuner = make_tuner(settings, load_paths(settings, listener.loading))
     lines: list[dict[str, Any]] = []
-    if stored is not None and (folder / PROGRESS).exists():
-        tuner.restore(folder)
-        lines = [json.loads(line) for line in (folder / PROGRESS).read_text().splitlines()]
-        # A line is written before its state and may be one ahead.
-        lines = [line for line in lines if line["solves"] <= tuner.solves]
+    if stored is not None and tuner.restore(folder):
+        lines = progress_until(tuner.solves, folder / PROGRESS)
     elif tuner.done:
         raise ValueError(
             f"one step of {settings.method} takes {tuner.cost:,} solves: give more than "
@@ -161,6 +157,27 @@ def write_result(result: Result, file: Path) -> None:
         write_policy(result, file)
 
 
+def progress_until(solves: int, file: Path) -> list[dict[str, Any]]:
+    """Lines of a `progress.jsonl` up to a state: a line is written before its state.
+
+    Raises
+    ------
+    ValueError
+        In one line, if they cannot be read, or are not those of the state.
+    """
+    try:
+        lines = [json.loads(line) for line in file.read_text().splitlines()]
+        kept = [line for line in lines if line["solves"] <= solves]
+        if not kept or kept[-1]["solves"] != solves:
+            raise ValueError(f"it does not tell of the step that ended at {solves:,} solves")
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(
+            f"{file} cannot be used ({reason}): give another --out, and the tuning begins anew"
+        ) from None
+    return kept
+
+
 def stored_settings(folder: Path) -> Mapping[str, Any] | None:
     """Settings of the tuning in a folder; None where there is none.
 
@@ -174,7 +191,9 @@ def stored_settings(folder: Path) -> Mapping[str, Any] | None:
         return None
     try:
         content: dict[str, Any] = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
+        if not isinstance(content, dict):
+            raise TypeError(f"{SETTINGS} holds no settings")
+    except (OSError, TypeError, ValueError) as error:
         raise ValueError(f"{folder} holds no tuning to go on with: {error}") from None
     return content
 

@@ -70,3 +70,30 @@ def add_tuning_options(tune: argparse.ArgumentParser) -> None:
         "catalogue and rl learning_rate, last_learning_rate, rollout, batch, epochs, discount, "
         "gae_lambda, clip_range, deviation, hidden, segment",
     )  # fmt: skip
+
+
+def add_study_options(study: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    study.add_argument("--out", type=Path, default=Path("results/tuning-study"), metavar="DIR")
+    study.add_argument(
+        "--seeds", type=int, default=10, metavar="N", help="trainings a rung (default 10)"
+    )
+    study.add_argument(
+        "--solves", type=float, default=300_000, metavar="N", help="of a training (default 3e5)"
+    )
+    study.add_argument(
+        "--rungs", nargs="+", metavar="NAME", help="default: all; an unknown one lists them"
+    )
+    study.add_argument(
+        "--drives", type=int, default=8, metavar="N",
+        help="drives a path that judge a training (default 8)",
+    )  # fmt: skip
+    study.add_argument(
+        "--tracks", type=Path, metavar="DIR",
+        help="folder of TUMFTM centre lines (x_m,y_m,...): one more set, scaled to the vehicle",
+    )  # fmt: skip
+    study.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2)")
+    study.add_argument(
+        "--quick", action="store_true",
+        help="2 trainings of 20,000 solves, 2 drives a path, no oracle: what it looks like",
+    )  # fmt: skip

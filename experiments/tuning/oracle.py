@@ -51,7 +51,8 @@ def pool_of(count: int, found: Sequence[TrackingWeights], seed: int = 0) -> Arra
     drawn = np.tile(base, (count, 1))
     drawn[:, :8] *= np.exp((limit * (2.0 * points - 1.0)) @ directions.T)
     given = np.array([one.as_array() for one in found]).reshape(-1, 10)
-    return np.clip(np.vstack([base, given, drawn]), LOWEST, HIGHEST)
+    pool: Array = np.clip(np.vstack([base, given, drawn]), LOWEST, HIGHEST)
+    return pool
 
 
 def loop_of(envs: PathTrackingVectorEnv) -> ClosedLoop:
@@ -112,31 +113,32 @@ def headroom(scores: Array, known: Array) -> list[Headroom]:
         "noise, lag and dead time, each high or low": cells,
         "the drive, disturbances included": rows * seeds + columns,
     }
-    halves = columns % 2
+    every, odd = np.ones((paths, seeds), dtype=np.bool_), columns % 2 == 1
     told = []
     for name, group in groups.items():
-        found = _chosen(scores, group, np.ones_like(halves), np.ones_like(halves))
+        found = _chosen(scores, group, every, every) / (paths * seeds)
         ahead = None
-        if group.max() + 1 < paths * seeds:
-            ahead = 0.5 * sum(
-                _chosen(scores, group, halves == half, halves != half) for half in (0, 1)
+        # One seed leaves none to choose on, and a drive by itself none like it.
+        if seeds > 1 and group.max() + 1 < paths * seeds:
+            ahead = (_chosen(scores, group, odd, ~odd) + _chosen(scores, group, ~odd, odd)) / (
+                paths * seeds
             )
-        told.append(Headroom(name, float(found), None if ahead is None else float(ahead)))
+        told.append(Headroom(name, found, ahead))
     return told
 
 
 def _chosen(scores: Array, group: Array, chosen_on: Array, scored_on: Array) -> float:
-    """Mean score where every group takes the set that is best on some drives, on others."""
-    total, count = 0.0, 0
+    """Sum of scores where every group takes the set that is best on some drives, on others.
+
+    A group with none to choose on takes the set that is best for all.
+    """
+    total = 0.0
     by_drive = scores.transpose(0, 2, 1)
     for value in np.unique(group):
         own = group == value
-        seen, judged = by_drive[own & (chosen_on > 0)], by_drive[own & (scored_on > 0)]
-        if len(seen) == 0 or len(judged) == 0:
-            seen = judged = by_drive[own]
-        total += judged[:, seen.mean(axis=0).argmin()].sum()
-        count += len(judged)
-    return total / count
+        seen = own & chosen_on if (own & chosen_on).any() else chosen_on
+        total += by_drive[own & scored_on][:, by_drive[seen].mean(axis=0).argmin()].sum()
+    return float(total)
 
 
 def varied(scores: Array, count: int) -> list[int]:

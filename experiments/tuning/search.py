@@ -6,7 +6,8 @@ again with the scores that are known: it draws the same candidates.
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -47,30 +48,36 @@ class Search(Tuner):
         """NMPC solves so far."""
         return self._solves
 
+    @property
+    def played(self) -> dict[str, Any]:
+        """All there is to keep, in plain JSON."""
+        return {"judged": self.judged, "solves": self._solves}
+
+    def play(self, played: Mapping[str, Any]) -> None:
+        """Play kept scores again.
+
+        Raises
+        ------
+        ValueError, KeyError, TypeError
+            For what `played` has not given.
+        """
+        judged = [[float(score) for score in row] for row in played["judged"]]
+        solves = int(played["solves"])
+        for row in judged:
+            if len(row) != len(self.ask()):
+                raise ValueError("its generations are of another size")
+            if not np.isfinite(row).all():
+                raise ValueError("its scores are not finite")
+            self.tell(row)
+        self.judged, self._solves = judged, solves
+
     def save(self, folder: Path) -> None:
         """Write the scores so far."""
-        content = {"format": FORMAT, "judged": self.judged, "solves": self._solves}
-        write_atomically(folder / STATE, json.dumps(content).encode())
+        write_state(folder, self.played)
 
-    def restore(self, folder: Path) -> None:
-        """Play the scores of a folder again."""
-        file = folder / STATE
-        try:
-            content = json.loads(file.read_text())
-            if content["format"] != FORMAT:
-                raise ValueError(f"its format is {content['format']!r}, not {FORMAT!r}")
-            judged = [[float(score) for score in row] for row in content["judged"]]
-            solves = int(content["solves"])
-            for row in judged:
-                if len(row) != len(self.ask()):
-                    raise ValueError("its generations are of another size")
-                self.tell(row)
-        except (OSError, KeyError, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise ValueError(
-                f"{file} cannot be used ({reason}): remove it, and the tuning begins anew"
-            ) from None
-        self.judged, self._solves = judged, solves
+    def restore(self, folder: Path) -> bool:
+        """Play the scores of a folder again; False where there are none."""
+        return restore_state(folder, self.play)
 
     def ask(self) -> list[Array]:
         """Candidates of the next generation, points (rows * entries,)."""
@@ -119,7 +126,23 @@ class CmaSearch(Search):
         super().__init__(settings, paths)
         self.rows = rows
         self.drives = TuningDrives(settings, paths)
-        self._es = evolution(settings, rows * self.entries, settings.seed)
+        self._random: Any = np.random.get_state()  # noqa: NPY002
+        with self._own_random():
+            self._es = evolution(settings, rows * self.entries, settings.seed)
+
+    @contextmanager
+    def _own_random(self) -> Iterator[None]:
+        """Lend CMA-ES, which draws from NumPy's global generator, a state of its own.
+
+        Else searches side by side would disturb each other, and be others when played again.
+        """
+        outside = np.random.get_state()  # noqa: NPY002
+        np.random.set_state(self._random)  # noqa: NPY002
+        try:
+            yield
+        finally:
+            self._random = np.random.get_state()  # noqa: NPY002
+            np.random.set_state(outside)  # noqa: NPY002
 
     @property
     def cost(self) -> int:
@@ -128,12 +151,14 @@ class CmaSearch(Search):
 
     def ask(self) -> list[Array]:
         """Draw candidates."""
-        self._asked = self._es.ask()
+        with self._own_random():
+            self._asked = self._es.ask()
         return [np.asarray(point) for point in self._asked]
 
     def tell(self, scores: Sequence[float]) -> None:
         """Update the distribution."""
-        self._es.tell(self._asked, list(scores))
+        with self._own_random():
+            self._es.tell(self._asked, list(scores))
 
     def judge(self, points: list[Array], number: int) -> list[float]:
         """Mean scores, all of the same drives."""
@@ -152,6 +177,39 @@ class CmaSearch(Search):
         """Mean of the distribution."""
         mean: Array = np.asarray(self._es.result.xfavorite).reshape(self.rows, self.entries)
         return mean
+
+
+def write_state(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write what a search is resumed from, atomically."""
+    write_atomically(folder / STATE, json.dumps({"format": FORMAT, **content}).encode())
+
+
+def restore_state(folder: Path, play: Callable[[Any], None]) -> bool:
+    """Hand what `write_state` wrote to `play`; False where there is no such file.
+
+    Raises
+    ------
+    ValueError
+        In one line, if the file cannot be used.
+    """
+    file = folder / STATE
+    if not file.exists():
+        return False
+    try:
+        content = json.loads(file.read_text())
+        if content["format"] != FORMAT:
+            raise ValueError(f"its format is {content['format']!r}, not {FORMAT!r}")
+        play(content)
+    except KeyError as error:
+        raise ValueError(_useless(file, f"no {error} in it")) from None
+    except (OSError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        raise ValueError(_useless(file, str(error))) from None
+    return True
+
+
+def _useless(file: Path, reason: str) -> str:
+    reason = " ".join(reason.split())
+    return f"{file} cannot be used ({reason}): remove it, and the tuning begins anew"
 
 
 def evolution(settings: TuningSettings, size: int, seed: int) -> Any:

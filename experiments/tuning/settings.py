@@ -1,14 +1,17 @@
 """Everything that determines a tuning, and the defaults of each method."""
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 from agents.weight_tuning.choice import DIRECTIONS
 from agents.weight_tuning.views import VIEWS
 from experiments.suites import HELD_OUT, SIX
+from experiments.training.hyperparameters import LEAST, MOST
 from experiments.training.settings import MOST_PATHS
 from lpv_track_env import conditions, vehicle
 from lpv_track_env.naming import choose
@@ -27,7 +30,7 @@ LEARNED = ("catalogue", "rl")
 
 PPO: dict[str, Any] = {
     "learning_rate": 3e-3, "last_learning_rate": 3e-4, "rollout": 16, "batch": 256, "epochs": 10,
-    "discount": 0.9, "gae_lambda": 0.9, "clip_range": 0.2, "deviation": 0.6, "hidden": [32, 32],
+    "discount": 0.9, "gae_lambda": 0.9, "clip_range": 0.2, "deviation": 1.0, "hidden": [32, 32],
     "segment": 50_000,
 }  # fmt: skip
 HYPERPARAMETERS: dict[str, dict[str, Any]] = {
@@ -87,6 +90,14 @@ class TuningSettings:
             _check(key, value, known[key])
         object.__setattr__(self, "hyperparameters", {**known, **self.hyperparameters})
         object.__setattr__(self, "trajectories", tuple(self.trajectories))
+        self._check_numbers()
+        for name in self.trajectories:
+            if name.removesuffix("-raw") in (*SIX, *HELD_OUT):
+                raise ValueError(f"{name} is for evaluation: tune on other paths")
+        conditions.load(self.conditions)
+        vehicle.load(self.vehicle)
+
+    def _check_numbers(self) -> None:
         for name in ("solves", "paths", "drives"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -94,13 +105,12 @@ class TuningSettings:
             raise ValueError(f"paths must be at most {MOST_PATHS}, not {self.paths}")
         if not 0 <= self.seed < 1000:
             raise ValueError(f"seed must be in [0, 999], not {self.seed}")
+        if not 1.0 < self.span <= 1e4:
+            raise ValueError(f"span must be above 1 and at most 10000, not {self.span}")
+        if not self.window > 0.0:
+            raise ValueError(f"window must be positive, not {self.window} s")
         if not self.time_limit >= self.window:
             raise ValueError(f"time_limit must be at least the window, {self.window} s")
-        for name in self.trajectories:
-            if name.removesuffix("-raw") in (*SIX, *HELD_OUT):
-                raise ValueError(f"{name} is for evaluation: tune on other paths")
-        conditions.load(self.conditions)
-        vehicle.load(self.vehicle)
 
     @property
     def periods(self) -> int:
@@ -108,8 +118,13 @@ class TuningSettings:
         return max(math.ceil(self.time_limit / self.control_period - 1e-9), 1)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as JSON gives them back."""
-        plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        """Plain values, as JSON gives them back, and digests of the files that are named."""
+        files = {
+            name: hashlib.sha256(Path(name).read_bytes()).hexdigest()
+            for name in (self.vehicle, *self.trajectories)
+            if Path(name).is_file()
+        }
+        plain: dict[str, Any] = json.loads(json.dumps({**asdict(self), "files": files}))
         return plain
 
 
@@ -135,5 +150,8 @@ def _check(key: str, value: Any, usual_value: Any) -> None:
     else:
         kinds = {int} if isinstance(usual_value, int) else {int, float}
         good = type(value) in kinds and math.isfinite(value) and value > 0
+        least, most = LEAST.get(key, 0), MOST.get(key, math.inf)
+        if good and not least <= value <= most:
+            raise ValueError(f"hyperparameter {key} must be in [{least}, {most}], not {value}")
     if not good:
         raise ValueError(f"hyperparameter {key} must be like {usual_value!r}, not {value!r}")

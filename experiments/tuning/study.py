@@ -6,6 +6,8 @@ A folder holds all of it: `trainings/LABEL-SEED/` as `lpv-track tune` leaves the
 
 import io
 import json
+import zipfile
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,7 +85,7 @@ def read_figures(file: Path) -> Figures:
     try:
         with np.load(file, allow_pickle=False) as content:
             return {name: content[name] for name in FIGURES}
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         reason = " ".join(str(error).split())
         raise ValueError(
             f"{file} cannot be used ({reason}): remove it, and it is made anew"

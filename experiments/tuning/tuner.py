@@ -46,8 +46,8 @@ class Tuner(ABC):
         """Write what `restore` goes on from, atomically."""
 
     @abstractmethod
-    def restore(self, folder: Path) -> None:
-        """Take up what `save` wrote.
+    def restore(self, folder: Path) -> bool:
+        """Take up what `save` wrote; False where there is nothing of it, as before the first step.
 
         Raises
         ------

@@ -1,0 +1,128 @@
+"""Pictures of the tuning study: learning curves, regret against solves, weights over curvature."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import agents
+from agents.nmpc.closed_loop import ClosedLoop
+from agents.weight_tuning.deciding import Decider
+from agents.weight_tuning.files import load
+from agents.weight_tuning.policy import WeightPolicy
+from agents.weights import TrackingWeights
+from experiments.figures import COLOURS, render
+from experiments.tuning.evaluation import EvaluationSet
+from experiments.tuning.loop import WEIGHTS
+from experiments.tuning.study import Study
+from experiments.tuning.study_tables import Judged
+from experiments.tuning.tuner import Result
+from lpv_track_env.vector_env import PathTrackingVectorEnv
+from trajectories import CurvatureBands
+
+Array = NDArray[Any]
+
+GROUPS = {"speed": (0, 4), "heading": (1, 5), "position": (2, 3, 6, 7)}
+"""Indices of Q and S by what they weigh."""
+WINDOWS = 40
+
+
+def learning_curves(study: Study, labels: Sequence[str]) -> str:
+    """SVG: scores of what was tried over solves, mean over trainings."""
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        for k, label in enumerate(labels):
+            runs = [lines for seed in study.seeds if (lines := study.progress(label, seed))]
+            if not runs:
+                continue
+            length = min(len(lines) for lines in runs)
+            solves = [line["solves"] for line in runs[0][:length]]
+            scores = np.mean([[line["score"] for line in lines[:length]] for lines in runs], axis=0)
+            axes.plot(solves, scores, color=COLOURS[k % len(COLOURS)], label=label, lw=1.2)
+        axes.set(xlabel="NMPC solves", ylabel="score of what was tried", xscale="log")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7)
+
+    return render(draw, 3.0, "learning")
+
+
+def regret(rows: Sequence[Judged], greedy: float) -> str:
+    """SVG: score above the greedy oracle's against the solves that it took."""
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        for k, row in enumerate(rows):
+            low, high = row.score.low - greedy, row.score.high - greedy
+            axes.errorbar(
+                max(row.solves, 1e4), row.score.value - greedy,
+                yerr=[[row.score.value - row.score.low], [row.score.high - row.score.value]],
+                color=COLOURS[k % len(COLOURS)], marker="o", capsize=3, label=row.rung.label,
+            )  # fmt: skip
+            assert low <= high
+        axes.set(xlabel="NMPC solves", ylabel="regret to the greedy oracle", xscale="log")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7)
+
+    return render(draw, 3.0, "regret")
+
+
+def weights_in_use(result: Result, given: EvaluationSet) -> tuple[Array, Array]:
+    """Weights (m, 10) and bands (m,) of the windows of some drives."""
+    settings: dict[str, Any] = {"autoreset_mode": "Disabled", **given.env_settings}
+    used, bands = [], []
+    for path in given.trajectories[:6]:
+        envs = PathTrackingVectorEnv(
+            given.seeds, path, given.vehicle, conditions=given.conditions, **settings
+        )
+        decider = None
+        more: dict[str, Any] = {}
+        if isinstance(result, WeightPolicy):
+            decider = Decider(result.choice, result.layers, envs.single.control_period)
+        else:
+            more = {"weights": result}
+        agent: Any = agents.make("lpv-nmpc", envs.single, **more)
+        loop = ClosedLoop(envs, agent, decider=decider)
+        loop.reset(seed=0)
+        for _ in range(WINDOWS):
+            loop.drive(8)
+            running = loop.running
+            used.append(loop.memory.nmpc.weights[running].copy())
+            bands.append(loop.memory.nmpc.bands[running].copy())
+    return np.concatenate(used), np.concatenate(bands)
+
+
+def weights_over_curvature(study: Study, labels: Sequence[str], given: EvaluationSet) -> str:
+    """SVG: factors on the default weights in each band, medians and quartiles over drives."""
+    names = CurvatureBands().names
+    base = TrackingWeights().as_array()
+
+    def draw(figure: Any) -> None:
+        every = figure.subplots(1, len(GROUPS), sharey=True)
+        for axes, (group, indices) in zip(every, GROUPS.items(), strict=True):
+            for k, label in enumerate(labels):
+                result = load(study.training(label, study.seeds[0]) / WEIGHTS)
+                used, bands = weights_in_use(result, given)
+                used = np.where(used > 0.0, used, base)
+                factors = np.log10(used[:, list(indices)] / base[list(indices)]).mean(axis=1)
+                places, middles, lows, highs = [], [], [], []
+                for band in range(len(names)):
+                    own = factors[bands == band]
+                    if own.size:
+                        low, middle, high = np.quantile(own, [0.25, 0.5, 0.75])
+                        places.append(band + 0.12 * (k - 0.5 * len(labels)))
+                        middles.append(middle)
+                        lows.append(middle - low)
+                        highs.append(high - middle)
+                axes.errorbar(
+                    places, middles, yerr=[lows, highs], color=COLOURS[k % len(COLOURS)],
+                    marker="o", ms=3, capsize=2, lw=0.8, label=label,
+                )  # fmt: skip
+            axes.set_title(group, fontsize=9)
+            axes.set_xticks(range(len(names)), names, rotation=45, fontsize=7)
+            axes.grid(alpha=0.3)
+        every[0].set_ylabel("lg factor on default Q, S")
+        every[-1].legend(fontsize=7)
+
+    return render(draw, 2.6, "weights")

@@ -1,0 +1,220 @@
+"""A tuning that was interrupted, killed or damaged: it goes on bit for bit, or says why not."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_tunings import SMALL, Counted, bits, progress, refusal, tuned, words
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("cma")
+import torch
+
+from experiments import cli
+from experiments.training import checkpoint
+from experiments.training.lock import alone_in
+from experiments.tuning import loop
+from experiments.tuning.search import STATE
+from experiments.tuning.tuner import Tuner
+from lpv_track_env.vehicle import VEHICLES
+
+RESUMED = ("search", "paper", "gradient", "rl")
+"""Those whose files differ in kind."""
+
+
+def state_of(method: str) -> str:
+    return checkpoint.NAME if method in {"rl", "catalogue"} else STATE
+
+
+def interrupted(method: str, folder: Path, *more: str) -> None:
+    assert cli.main([*words(method, *more), "--out", str(folder)]) == 130
+    assert not (folder / "weights.json").exists()
+
+
+@pytest.mark.parametrize("method", SMALL)
+def test_interrupted_anywhere_it_ends_as_if_it_was_not(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted = Counted(monkeypatch)
+    whole = tuned(method, tmp_path / "whole")
+    drives = counted.calls
+
+    out = tmp_path / "parts"
+    # In the first step: nothing is kept yet.
+    counted.calls, counted.interrupted_at = 0, 1
+    interrupted(method, out)
+    assert not (out / state_of(method)).exists()
+    # Between the first step's line and its state.
+    made = loop.make_tuner
+
+    def unsaved(*given: Any) -> Tuner:
+        tuner = made(*given)
+
+        def save(_: Path) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(tuner, "save", save)
+        return tuner
+
+    with monkeypatch.context() as patched:
+        patched.setattr(loop, "make_tuner", unsaved)
+        interrupted(method, out, "--resume")
+        assert (out / "progress.jsonl").exists()
+        assert not (out / state_of(method)).exists()
+    # In a later step.
+    counted.calls, counted.interrupted_at = 0, drives // 2 + 1
+    interrupted(method, out, "--resume")
+    assert (out / state_of(method)).exists()
+    kept = len((out / "progress.jsonl").read_text().splitlines())
+    assert kept >= 1
+    # Between the next step's line and its state.
+    with monkeypatch.context() as patched:
+        patched.setattr(loop, "make_tuner", unsaved)
+        interrupted(method, out, "--resume")
+        assert len((out / "progress.jsonl").read_text().splitlines()) == kept + 1
+    counted.interrupted_at = -1
+    parts = tuned(method, out, "--resume")
+    assert bits(parts) == bits(whole)
+    assert progress(parts) == progress(whole)
+
+
+@pytest.mark.parametrize("method", ["bands", "catalogue"])
+def test_killed_it_goes_on_bit_for_bit(method: str, tmp_path: Path) -> None:
+    steps, out = 20, tmp_path / "killed"
+    command = [sys.executable, "-m", "experiments", *words(method, steps=steps)]
+    path = os.pathsep.join([str(Path(cli.__file__).parents[1]), *sys.path])
+    with subprocess.Popen(
+        [*command, "--out", str(out)], env={**os.environ, "PYTHONPATH": path},
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        lines = out / "progress.jsonl"
+        while process.poll() is None:
+            if lines.exists() and len(lines.read_text().splitlines()) > 1:
+                process.send_signal(signal.SIGKILL)
+                break
+            time.sleep(0.002)
+        assert process.wait() == -signal.SIGKILL
+    assert not (out / "weights.json").exists()
+    assert 1 < len(lines.read_text().splitlines()) < steps
+    resumed = tuned(method, out, "--resume", steps=steps)
+    assert not list(out.glob("*.tmp*"))
+    whole = tuned(method, tmp_path / "whole", steps=steps)
+    assert bits(resumed) == bits(whole)
+    assert progress(resumed) == progress(whole)
+
+
+@pytest.fixture(name="half", params=RESUMED)
+def fixture_half(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> tuple[str, Path, Path]:
+    """A method, the weights that it comes to, and a folder in which it is halfway there."""
+    method: str = request.param
+    counted = Counted(monkeypatch)
+    whole = tuned(method, tmp_path / "whole")
+    counted.calls, counted.interrupted_at = 0, counted.calls // 2 + 1
+    interrupted(method, tmp_path / "half")
+    counted.interrupted_at = -1
+    return method, whole, tmp_path / "half"
+
+
+def test_a_state_that_cannot_be_used_is_one_line_and_its_advice_helps(
+    half: tuple[str, Path, Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    method, whole, out = half
+    file = out / state_of(method)
+    good = file.read_bytes()
+    if file.name == STATE:
+        kept = json.loads(good)
+        other = json.loads((tmp_path / "whole" / STATE).read_text())
+        texts = [
+            "", "[]", "null", "{}", '{"format": "lpv-track-search/0"}', "[" * 100_000,
+            json.dumps({"format": kept["format"]}), good[: len(good) // 2].decode(),
+            good.decode().replace("[[", "[[1.0, ", 1), good.decode().replace("[[", "[[NaN, ", 1),
+            good.decode().replace("[[", "[3.0, [", 1), good.decode().replace("[[", '[["a", ', 1),
+            json.dumps({**other, "solves": None, "straight": None}),
+        ]  # fmt: skip
+        bad = [*(text.encode() for text in texts), b"\xff\xfe", bytes(100)]
+    else:
+        kept = torch.load(file, weights_only=True)
+        bad = [b"", good[:-1], good[: len(good) // 2], b"{}"]
+        networks = kept["parameters"]
+        narrow = {key: value[:1] for key, value in networks["policy"].items()}
+        foreign = [
+            {}, {**kept, "parameters": {}}, {**kept, "solves": "many"}, {**kept, "segment": None},
+            {**kept, "parameters": {**networks, "policy": narrow}},
+            {**kept, "parameters": {**networks, "policy": {}}},
+        ]  # fmt: skip
+        for content in foreign:
+            checkpoint.write(out, {**content, "format": checkpoint.FORMAT})
+            bad.append(file.read_bytes())
+    for content in bad:
+        file.write_bytes(content)
+        error = refusal(capsys, *words(method, "--resume"), "--out", str(out))
+        assert str(file) in error, content[:80]
+        assert "remove it" in error
+    file.unlink()
+    assert bits(tuned(method, out, "--resume")) == bits(whole)
+
+
+def test_other_files_that_cannot_be_used_are_one_line(
+    half: tuple[str, Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    method, whole, out = half
+    for name, contents in (
+        ("progress.jsonl", ("", "{", "[]\n", "null\n", '{"step": 0}\n', '{"solves": "few"}\n')),
+        ("settings.json", ("", "{", "[]", "null", "\0")),
+    ):
+        good = (out / name).read_text()
+        for content in contents:
+            (out / name).write_text(content)
+            error = refusal(capsys, *words(method, "--resume"), "--out", str(out))
+            assert str(out) in error, content
+        (out / name).write_text(good)
+    (out / "progress.jsonl").unlink()
+    assert "progress.jsonl" in refusal(capsys, *words(method, "--resume"), "--out", str(out))
+    (out / "progress.jsonl").write_bytes((whole.parent / "progress.jsonl").read_bytes())
+    assert bits(tuned(method, out, "--resume")) == bits(whole)
+
+
+def test_other_settings_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    car = tmp_path / "car.json"
+    car.write_text(json.dumps(VEHICLES["m2-minibus"].as_dict()))
+    own = ["--vehicle", str(car), "--conditions-set", "steering_lag=0.1"]
+    weights = tuned("search", tmp_path / "out", *own)
+    common = [*words("search", *own), "--out", str(weights.parent)]
+    assert "--resume" in refusal(capsys, *common)
+    before = weights.read_bytes()
+    for given, said in (
+        (["--seed", "1"], "seed is 1, there 0"),
+        (["--solves", "999"], "solves is 999, there 270"),
+        (["--method", "gradient"], "method is 'gradient', there 'search'"),
+        (["--set", "sigma=0.5"], "hyperparameters is {'sigma': 0.5}, there {'sigma': 1.0}"),
+        (["--conditions-set", "steering_lag=0.2"], "conditions is"),
+        (["--vehicle", "m2-minibus"], "vehicle is 'm2-minibus'"),
+        (["--time-limit", "0.6"], "time_limit is 0.6, there 0.5"),
+    ):
+        assert said in refusal(capsys, *common, "--resume", *given)
+    car.write_text(json.dumps(VEHICLES["course-car"].as_dict()))
+    assert "files is" in refusal(capsys, *common, "--resume")
+    assert weights.read_bytes() == before
+
+
+def test_a_tuning_at_its_end_stays_as_it_is(tmp_path: Path) -> None:
+    for method in (*RESUMED, "fixed"):
+        weights = tuned(method, tmp_path / method)
+        found = bits(weights)
+        assert bits(tuned(method, tmp_path / method, "--resume")) == found
+
+
+def test_one_process_tunes_in_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with alone_in(tmp_path):
+        error = refusal(capsys, *words("search"), "--out", str(tmp_path))
+    assert "another process" in error
+    assert not (tmp_path / "settings.json").exists()
+    tuned("search", tmp_path)
