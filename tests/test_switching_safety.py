@@ -167,6 +167,7 @@ def test_lost_vehicles_are_lost_once_and_what_failed_is_counted() -> None:
     told = summary(found)
     assert 0 < told["lost"] == told["ends"]["left_corridor"]
     lost = found.ends == k.LEFT_CORRIDOR
+    assert told["lost_seeds"] == np.flatnonzero(lost).tolist()
     assert (found.largest[lost] > 0.02).all()
     assert (found.largest[~lost] <= 0.02).all()
     assert (found.steps[lost] < 80).all()
@@ -200,7 +201,7 @@ def test_weights_before_a_loss() -> None:
     used[0, 8:] = np.nan
     ends = np.array([k.LEFT_CORRIDOR, k.TIME_LIMIT])
     zeros = np.zeros(2)
-    outcome = Outcome(ends, zeros, zeros, zeros, zeros, zeros, zeros, used, Counter())
+    outcome = Outcome(zeros, ends, zeros, zeros, zeros, zeros, zeros, zeros, used, Counter())
     found = weights_before_loss(outcome)
     assert found["Q_y"]["before_loss"] == pytest.approx(-3.0)
     assert found["Q_y"]["all"] == pytest.approx(-3.0 * 5 / 18)
@@ -220,7 +221,10 @@ def test_the_widest_span_in_which_none_is_lost() -> None:
     said = widest_kept({"arms": rows})
     assert "random, no limit: span 100;" in said
     assert "random, slew limit: the whole bounds;" in said
-    assert said.endswith("adversary, no limit: no span")
+    assert "adversary, no limit: no span;" in said
+    assert said.endswith("in every way: no span")
+    del rows["worst"]
+    assert widest_kept({"arms": rows}).endswith("in every way: span 100")
 
 
 # The command ---------------------------------------------------------------------------------

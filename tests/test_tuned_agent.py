@@ -17,6 +17,7 @@ import agents
 from agents.delay import DelayCompensated
 from agents.nmpc.closed_loop import ClosedLoop
 from agents.nmpc.closed_loop_kernels import attend
+from agents.weight_tuning import files
 from agents.weight_tuning.agent import TunedNmpc
 from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.deciding import Decider
@@ -339,6 +340,15 @@ def test_files_of_weights(tmp_path: Path) -> None:
     )
     observation = env.arrays.observations.copy()
     np.testing.assert_array_equal(given.predict(observation)[0], read.predict(observation)[0])
+    files.write(POLICIES["joint"], tmp_path / "policy.json")
+    given, read = (
+        agents.make(NAME, env.single, weights=weights)
+        for weights in (POLICIES["joint"], tmp_path / "policy.json")
+    )
+    assert read.predict(observation)[0].tolist() == given.predict(observation)[0].tolist()
+    (tmp_path / "other.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"other.json"):
+        agents.make(NAME, env.single, weights=tmp_path / "other.json")
     with pytest.raises(ValueError, match=r"weights .*none.json: no such file; give weights="):
         agents.make(NAME, env.single, weights=tmp_path / "none.json")
     with pytest.raises(ValueError, match="not dict"):

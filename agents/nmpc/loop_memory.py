@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from agents.delay import NearFuture
 from agents.delay_kernels import FOOT
 from agents.nmpc.rti_agent import RtiMemory
-from agents.weight_tuning.watching import CLOCK, FRESH, WATCH
+from agents.weight_tuning.watching import AGE, CLOCK, FRESH, WATCH
 
 Array = NDArray[Any]
 
@@ -72,7 +72,7 @@ class LoopMemory:
         """Let a control period pass without an action: of every row the last command stays."""
         self.commands[:, 1:] = self.commands[:, :-1].copy()
         self.watched[:, FRESH] = 0.0
-        self.watched[:, CLOCK] += 1.0
+        self.watched[:, [CLOCK, AGE]] += 1.0
 
     def copy(self, rows: Array, onto: Array) -> None:
         """Make rows `onto` (m,) those that `rows` (m,) are."""

@@ -18,6 +18,7 @@ from agents.reference import NODE
 from agents.registry import CHECKPOINTS
 from agents.weight_tuning.deciding import NOBODY, Decider
 from agents.weight_tuning.deciding_rows import finish_rows, prepare_rows
+from agents.weight_tuning.files import load
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.watching import REJECTED
 from agents.weights import TrackingWeights, WeightSchedule
@@ -27,12 +28,6 @@ Weights = WeightPolicy | WeightSchedule | TrackingWeights
 
 SHIPPED = CHECKPOINTS / "lpv-nmpc-tuned.json"
 """The weights that come with this project."""
-
-
-def load(file: str | Path) -> WeightSchedule | WeightPolicy:
-    """Read a file of weights."""
-    # TODO: agents.weight_tuning.files.load, which knows policies too.
-    return WeightSchedule.read(Path(file))
 
 
 class TunedNmpc:

@@ -127,6 +127,7 @@ class Setup:
 class Outcome:
     """What came of the episodes of an arm; arrays with an entry an episode."""
 
+    seeds: Array
     ends: Array
     largest: Array
     """Largest absolute lateral error, m."""
@@ -164,7 +165,8 @@ class Branches:
     ) -> Outcome:
         """Drive episodes of seeds first, first + 1, ...; `tick` is called after every window."""
         loop, n = self.loop, self.episodes
-        loop.reset(seed=[first + i for i in range(n) for _ in range(self.count)])
+        seeds = np.arange(first, first + n)
+        loop.reset(seed=np.repeat(seeds, self.count).tolist())
         sums = np.zeros((len(Tally._fields), n))
         largest, not_finite = np.zeros(n), np.zeros(n, dtype=np.bool_)
         used = np.full((n, setup.windows, TUNED), np.nan, dtype=np.float32)
@@ -190,7 +192,7 @@ class Branches:
             if row % self.count == 0:
                 statuses.update(ladder.counts)
         return Outcome(
-            loop.envs.arrays.ends[:: self.count].copy(), largest, total.lateral_square,
+            seeds, loop.envs.arrays.ends[:: self.count].copy(), largest, total.lateral_square,
             total.steps, total.solves, total.failures, not_finite, used, statuses,
         )  # fmt: skip
 

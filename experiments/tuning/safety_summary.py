@@ -39,6 +39,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     return {
         "episodes": episodes,
         "lost": failures,
+        "lost_seeds": outcome.seeds[lost].tolist(),
         "lost_upper_bound": upper_bound(failures, episodes),
         "ends": dict(ends),
         "not_finite": int(outcome.not_finite.sum()),
@@ -59,8 +60,8 @@ def summary(outcome: Outcome) -> dict[str, Any]:
 def weights_before_loss(outcome: Outcome) -> Mapping[str, Any]:
     """How weights were in the last windows of lost episodes, and otherwise.
 
-    Of log10(weight / default) and of its means over speed, heading and position, in Q and S: mean
-    before a loss, mean and standard deviation over all windows.
+    Of log10(weight / default), of its mean over the four weights on position and of differences:
+    mean before a loss, mean and standard deviation over all windows.
     """
     lost = failed(outcome.ends)
     decades = outcome.used / np.float32(math.log(10.0))
@@ -71,7 +72,7 @@ def weights_before_loss(outcome: Outcome) -> Mapping[str, Any]:
     values["Q_psi - Q_y"] = values["Q_psi"] - values["Q_y"]
     values["S_psi - S_y"] = values["S_psi"] - values["S_y"]
     values["position"] = decades[:, :, [2, 3, 6, 7]].mean(axis=2)
-    values["lateral"] = np.maximum(values["Q_y"], values["S_y"])
+    values["Q_vx - position"] = values["Q_vx"] - values["position"]
     return {
         name: {
             "before_loss": float(value[before].mean()),
@@ -114,11 +115,11 @@ def widest_kept(result: Mapping[str, Any]) -> str:
             span = WHOLE if row["span"] is None else row["span"]
             name = f"{row['mode']}, {'no limit' if row['slew'] is None else 'slew limit'}"
             spans.setdefault(name, []).append((span, row["lost"] > 0))
+    spans["in every way"] = [row for rows in spans.values() for row in rows]
     words = []
     for name, rows in spans.items():
-        narrowest_lost = min((span for span, lost in rows if lost), default=math.inf)
-        kept = [span for span, lost in rows if not lost and span <= narrowest_lost]
-        widest = max(kept, default=None)
+        lossy = [span for span, lost in rows if lost]
+        widest = max((span for span, _ in rows if not lossy or span < min(lossy)), default=None)
         said = "no span" if widest is None else f"span {widest:g}"
         words.append(f"{name}: {'the whole bounds' if widest == WHOLE else said}")
     return "none lost within: " + "; ".join(words)
