@@ -145,7 +145,7 @@ def test_a_policy_is_blind_to_what_is_hidden() -> None:
     for noise in (0.0, 100.0):
         np.testing.assert_allclose(forward(policy.layers)(x + noise * hidden), wanted, atol=1e-6)
     assert not policy.layers[0][0][:, hidden].any()
-    assert policy.choice is env.envs.choice
+    assert policy.choice == env.envs.choice
     assert policy.control_period == 0.05
 
 

@@ -46,7 +46,7 @@ def test_windows_are_those_driven_by_hand(name: str, conditions: str | Condition
         parts = hand.parts(driven, driven + steps)
         np.testing.assert_allclose(info["parts"], parts, rtol=1e-9, atol=1e-12)
         share = steps / round(choice.window / 0.05)
-        added = hand.marginal(driven, driven + steps).sum()
+        added = hand.marginal(driven, driven + steps, round(choice.window / 0.05)).sum()
         assert reward == pytest.approx(-share * added, rel=1e-9)
         driven += steps
         lengths.append(steps)

@@ -63,11 +63,11 @@ class _Announcement(event.Listener):
         ):
             return
         self.said = True
-        print(
-            "lpv-track-env: compiling numerical code (some seconds, once; then kept on disk) ...",
-            file=sys.stderr,
-            flush=True,
+        # In one piece: processes that compile side by side share the terminal.
+        sys.stderr.write(
+            "lpv-track-env: compiling numerical code (some seconds, once; then kept on disk) ...\n"
         )
+        sys.stderr.flush()
 
     def on_end(self, event: event.Event) -> None:
         pass
