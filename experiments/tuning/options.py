@@ -95,5 +95,5 @@ def add_study_options(study: argparse.ArgumentParser) -> None:
     study.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2)")
     study.add_argument(
         "--quick", action="store_true",
-        help="2 trainings of 20,000 solves, 2 drives a path, no oracle: what it looks like",
+        help="2 trainings of 60,000 solves, 2 drives a path, small oracles: what it looks like",
     )  # fmt: skip

@@ -54,7 +54,7 @@ def study_of(options: argparse.Namespace) -> Study:
         sets.append(track_set(options.tracks, options.drives))
     return Study(
         options.out, labels, tuple(range(2 if quick else options.seeds)),
-        20_000 if quick else int(solves), tuple(sets),
+        60_000 if quick else int(solves), tuple(sets),
     )  # fmt: skip
 
 
