@@ -26,6 +26,8 @@ from trajectories.atomic import write_atomically
 Array = NDArray[Any]
 Figures = dict[str, Array]
 
+SETTINGS = "study.json"
+
 
 @dataclass(frozen=True)
 class Study:
@@ -36,6 +38,39 @@ class Study:
     seeds: tuple[int, ...]
     solves: int
     sets: tuple[EvaluationSet, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """What decides what the trainings and their judgements are, in plain JSON."""
+        return {
+            "solves": self.solves,
+            "sets": {
+                one.name: {"paths": list(one.labels), "seeds": one.seeds, "vehicle": one.vehicle}
+                for one in self.sets
+            },
+        }  # fmt: skip
+
+    def claim(self) -> None:
+        """Make the folder this study's.
+
+        Raises
+        ------
+        ValueError
+            If it holds one of another budget, or other drives to judge on.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        file, own = self.folder / SETTINGS, self.as_dict()
+        if file.exists():
+            kept = json.loads(file.read_text())
+            same = kept["solves"] == own["solves"] and all(
+                kept["sets"].get(name, given) == given for name, given in own["sets"].items()
+            )
+            if not same:
+                raise ValueError(
+                    f"{self.folder} holds a study of another budget or other drives: give another "
+                    "--out"
+                )
+            own["sets"] = {**kept["sets"], **own["sets"]}
+        write_atomically(file, json.dumps(own, indent=2).encode())
 
     def training(self, label: str, seed: int) -> Path:
         """Folder of a training."""

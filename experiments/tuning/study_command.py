@@ -76,7 +76,7 @@ def track_set(folder: Path, seeds: int) -> EvaluationSet:
 def run_study(options: argparse.Namespace, console: Console) -> int:
     """Make the study; the exit code."""
     study = study_of(options)
-    study.folder.mkdir(parents=True, exist_ok=True)
+    study.claim()
     try:
         with progress_bar(console) as progress:
 

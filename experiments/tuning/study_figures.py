@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import EngFormatter, NullFormatter
 from numpy.typing import NDArray
 
 import agents
@@ -40,8 +41,11 @@ def learning_curves(study: Study, labels: Sequence[str]) -> str:
             length = min(len(lines) for lines in runs)
             solves = [line["solves"] for line in runs[0][:length]]
             scores = np.mean([[line["score"] for line in lines[:length]] for lines in runs], axis=0)
-            axes.plot(solves, scores, color=COLOURS[k % len(COLOURS)], label=label, lw=1.2)
+            colour = COLOURS[k % len(COLOURS)]
+            axes.plot(solves, scores, color=colour, label=label, lw=1.0, marker=".", ms=3)
         axes.set(xlabel="NMPC solves", ylabel="score of what was tried", xscale="log")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
 
@@ -54,14 +58,14 @@ def regret(rows: Sequence[Judged], greedy: float) -> str:
     def draw(figure: Any) -> None:
         axes = figure.subplots()
         for k, row in enumerate(rows):
-            low, high = row.score.low - greedy, row.score.high - greedy
             axes.errorbar(
                 max(row.solves, 1e4), row.score.value - greedy,
                 yerr=[[row.score.value - row.score.low], [row.score.high - row.score.value]],
                 color=COLOURS[k % len(COLOURS)], marker="o", capsize=3, label=row.rung.label,
             )  # fmt: skip
-            assert low <= high
         axes.set(xlabel="NMPC solves", ylabel="regret to the greedy oracle", xscale="log")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
 
