@@ -1,7 +1,5 @@
 """Agents that run a learned policy: compiled, without torch."""
 
-import math
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from agents.base import Action, DrivingTask, blind_control, observation_rows
 from agents.learned.files import read
 from agents.learned.network import Network
 from agents.learned.policy import ACTIONS, Policy
+from agents.made_for import check_task
 from agents.nmpc.rti_agent import RtiMemory, RtiNmpc, RtiRow
 from agents.registry import CHECKPOINTS
 
@@ -44,7 +43,7 @@ class LearnedPolicy:
         self.task = task
         name = f"policy {policy.algorithm!r}" if isinstance(policy, Policy) else f"policy {policy}"
         self.policy = policy if isinstance(policy, Policy) else read(policy)
-        _check_task(name, self.policy, task)
+        check_task(name, self.policy, task, stacklevel=4)
         self._size = task.layout.size
         self._network = Network.of(self.policy, *task.action_bounds)
         self._base = RtiNmpc(task) if self.policy.origin == "lpv-nmpc" else None
@@ -97,35 +96,6 @@ class LearnedPolicy:
         if self._base is None or memory is None:
             return {}
         return self._base.diagnostics(memory)
-
-
-def _check_task(name: str, policy: Policy, task: DrivingTask) -> None:
-    """Refuse a policy for observations or a control period that are not the task's."""
-    seen, here = policy.layout, task.layout
-    same_layout = seen.preview_steps == here.preview_steps and math.isclose(
-        seen.preview_period, here.preview_period, rel_tol=1e-9
-    )
-    same_period = math.isclose(policy.control_period, task.control_period, rel_tol=1e-9)
-    layout = f"preview_steps={seen.preview_steps}, preview_period={seen.preview_period:g}"
-    period = f"control_period={policy.control_period:g}"
-    if not same_layout:
-        wanted = layout if same_period else f"{layout}, {period}"
-        raise ValueError(
-            f"{name} sees {layout} s; this environment has {here.preview_steps} and "
-            f"{here.preview_period:g}: make the environment with {wanted}, or train one for it"
-        )
-    if not same_period:
-        raise ValueError(
-            f"{name} acts every {policy.control_period:g} s, this environment every "
-            f"{task.control_period:g}: make the environment with {period}, or train one for it"
-        )
-    trained = policy.training.get("vehicle")
-    if isinstance(trained, str) and trained != task.vehicle.name:
-        warnings.warn(
-            f"{name} was trained for vehicle {trained!r}, not for {task.vehicle.name!r}",
-            UserWarning,
-            stacklevel=4,
-        )
 
 
 def of_file(file: str | Path) -> Callable[[DrivingTask], LearnedPolicy]:
