@@ -146,7 +146,9 @@ def test_candidates_of_a_round_meet_the_same_drives_and_another_round_others() -
 def test_log_multipliers_are_bounded_by_the_span_and_leave_r() -> None:
     settings = usual("search", span=100.0)
     default = TrackingWeights().as_array()
-    moved = weights_at(np.array([[0.0] * 6, [math.log(2.0), 0, 0, 0, 0, 99.0]]), settings)
+    moved = weights_at(
+        np.array([[0.0] * 6, [math.log(2.0), 0, 0, 0, 0, 99.0]]), settings.directions, settings.span
+    )
     np.testing.assert_array_equal(moved[0], default)
     factors = [2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 100.0, 100.0, 1.0, 1.0]
     np.testing.assert_allclose(moved[1], default * factors, rtol=1e-14)

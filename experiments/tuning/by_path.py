@@ -89,7 +89,7 @@ class PathClassSearch(Tuner):
     def result(self, provenance: Mapping[str, Any]) -> WeightSchedule:
         """A set for each class."""
         found = {
-            band: weights_at(search.point[0], self.settings)
+            band: weights_at(search.point[0], self.settings.directions, self.settings.span)
             for band, search in self.searches.items()
         }
         rows = [found[min(found, key=lambda b: abs(b - band))] for band in range(len(self.bands))]

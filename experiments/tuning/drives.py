@@ -40,11 +40,11 @@ def load_paths(settings: TuningSettings, tick: Tick = lambda *_: None) -> list[R
     return paths
 
 
-def weights_at(point: Array, settings: TuningSettings) -> Array:
-    """Weights (..., 10) of log-multipliers (..., entries) on the default ones."""
-    matrix = DIRECTIONS[settings.directions]
+def weights_at(point: Array, directions: str, span: float) -> Array:
+    """Weights (..., 10) of log-multipliers (..., entries) on the default ones, within a span."""
+    matrix = DIRECTIONS[directions]
     weights = np.broadcast_to(TrackingWeights().as_array(), (*point.shape[:-1], 10)).copy()
-    limit = np.log(settings.span)
+    limit = np.log(span)
     weights[..., :8] *= np.exp(np.clip(point, -limit, limit) @ matrix.T)
     return np.clip(weights, LOWEST, HIGHEST)
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from experiments.tuning.drives import Array, TuningDrives, weights_at
+from experiments.tuning.drives import Array, TuningDrives
 from experiments.tuning.search import Search
 from experiments.tuning.settings import TuningSettings
 from trajectories import ReferencePath
@@ -45,9 +45,7 @@ class GradientSearch(Search):
     def judge(self, points: list[Array], number: int) -> list[float]:
         """Scores of one drive each; the two of a pair are alike but for their weights."""
         count = len(self.drives.bands)
-        tables = weights_at(
-            np.array(points).reshape(len(points), self.rows, self.entries), self.settings
-        )
+        tables = self.weights_of(np.array(points).reshape(len(points), self.rows, self.entries))
         before = self.drives.solves
         seeds = self.drives.seeds(number)
         scores = self.drives.scores(

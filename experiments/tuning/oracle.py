@@ -17,10 +17,10 @@ from scipy.stats import qmc
 
 import agents
 from agents.nmpc.closed_loop import ClosedLoop, Tally
-from agents.weight_tuning.choice import DIRECTIONS, SLEW, WeightChoice
-from agents.weight_tuning.score import parts_of, scores_of
+from agents.weight_tuning.choice import DIRECTIONS, SLEW
+from agents.weight_tuning.score import failed, parts_of, scores_of
 from agents.weights import HIGHEST, LOWEST, TrackingWeights
-from experiments.tuning.drives import threads
+from experiments.tuning.drives import threads, weights_at
 from experiments.tuning.evaluation import EvaluationSet
 from lpv_track_env import conditions_layout as layout
 from lpv_track_env import kernels as k
@@ -29,6 +29,8 @@ from trajectories import CurvatureBands
 
 Array = NDArray[Any]
 
+SPAN = 100.0
+"""Largest factor on a default weight in the pool: the tunings' own."""
 KNOWN = (layout.GNSS_NOISE, layout.STEERING_LAG, layout.STEERING_DEAD_TIME)
 """Conditions that cells are made of, each divided at its median."""
 
@@ -45,12 +47,11 @@ def pool_of(count: int, found: Sequence[TrackingWeights], seed: int = 0) -> Arra
     seed
         Of the sequence's scrambling.
     """
-    directions, limit = DIRECTIONS["stages"], np.log(WeightChoice(span=100.0).span)
-    points = qmc.Sobol(directions.shape[1], seed=seed).random(count)
-    base = TrackingWeights().as_array()
-    drawn = np.tile(base, (count, 1))
-    drawn[:, :8] *= np.exp((limit * (2.0 * points - 1.0)) @ directions.T)
+    limit = np.log(SPAN)
+    points = qmc.Sobol(DIRECTIONS["stages"].shape[1], seed=seed).random(count)
+    drawn = weights_at(limit * (2.0 * points - 1.0), "stages", SPAN)
     given = np.array([one.as_array() for one in found]).reshape(-1, 10)
+    base = TrackingWeights().as_array()
     pool: Array = np.clip(np.vstack([base, given, drawn]), LOWEST, HIGHEST)
     return pool
 
@@ -188,8 +189,7 @@ def greedy(
             tally = loop.drive(window * ahead, tables)
             ends[:n] = kept
             cost = parts_of(tally).sum(axis=1) * tally.steps / (window * ahead)
-            lost = np.isin(ends[n:], (k.LEFT_CORRIDOR, k.WRONG_HEADING, k.NON_FINITE))
-            cost[n:] += 1e3 * lost
+            cost[n:] += 1e3 * failed(ends[n:])
             best = cost[n:].reshape(n, count).argmin(axis=1)
             tables[:n] = pool[best]
             ends[n:] = k.TIME_LIMIT

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from agents.weight_tuning.score import failed
 from experiments.tuning.safety import CONTROL, WHOLE, Outcome
+from experiments.tuning.statistics import failure_bound
 from lpv_track_env import kernels as k
 
 Array = NDArray[Any]
@@ -19,15 +20,6 @@ Array = NDArray[Any]
 BEFORE = 5
 """Windows before a vehicle is lost that are looked at for what lost it: 2 s."""
 TUNED_NAMES = tuple(f"{matrix}_{state}" for matrix in "QS" for state in ("vx", "psi", "x", "y"))
-
-
-def upper_bound(failures: int, episodes: int, confidence: float = 0.95) -> float:
-    """Clopper and Pearson's upper bound of a rate: one-sided, exact for independent episodes."""
-    from scipy.stats import beta
-
-    if failures == episodes:
-        return 1.0
-    return float(beta.ppf(confidence, failures + 1, episodes - failures))
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:
@@ -40,7 +32,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "episodes": episodes,
         "lost": failures,
         "lost_seeds": outcome.seeds[lost].tolist(),
-        "lost_upper_bound": upper_bound(failures, episodes),
+        "lost_upper_bound": failure_bound(failures, episodes),
         "ends": dict(ends),
         "not_finite": int(outcome.not_finite.sum()),
         "periods": int(outcome.steps.sum()),

@@ -6,6 +6,7 @@ again with the scores that are known: it draws the same candidates.
 
 import json
 import math
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -79,22 +80,26 @@ class Search(Tuner):
         """Play the scores of a folder again; False where there are none."""
         return restore_state(folder, self.play)
 
+    @abstractmethod
     def ask(self) -> list[Array]:
         """Candidates of the next generation, points (rows * entries,)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def tell(self, scores: Sequence[float]) -> None:
         """Learn from the scores of what `ask` gave."""
-        raise NotImplementedError
 
+    @abstractmethod
     def judge(self, points: list[Array], number: int) -> list[float]:
         """Scores of a generation's points."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def point(self) -> Array:
         """Best guess so far, (rows, entries)."""
-        raise NotImplementedError
+
+    def weights_of(self, point: Array) -> Array:
+        """Weights (..., 10) of points (..., entries)."""
+        return weights_at(point, self.settings.directions, self.settings.span)
 
     def step(self) -> dict[str, float]:
         """One generation."""
@@ -107,7 +112,7 @@ class Search(Tuner):
     def result(self, provenance: Mapping[str, Any]) -> WeightSchedule:
         """A schedule: a set for every band, all the same where there is but one."""
         bands = CurvatureBands()
-        sets = weights_at(self.point, self.settings)
+        sets = self.weights_of(self.point)
         rows = np.broadcast_to(sets, (len(bands), 10))
         return WeightSchedule(
             bands, tuple(TrackingWeights.from_array(row) for row in rows), slew=SLEW,
@@ -165,7 +170,7 @@ class CmaSearch(Search):
         before = self.drives.solves
         scores = []
         for point in points:
-            table = weights_at(point.reshape(self.rows, self.entries), self.settings)
+            table = self.weights_of(point.reshape(self.rows, self.entries))
             count = len(self.drives.bands)
             tables = np.broadcast_to(table, (count, 10))[None]
             scores.append(float(self.drives.scores(tables, number).mean()))
