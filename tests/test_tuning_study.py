@@ -21,8 +21,10 @@ from agents.weight_tuning.score import FAILED, PARTS
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments.cases import Case, run_case
 from experiments.metrics import evaluate
+from experiments.options import parser
 from experiments.rollout import rollout
 from experiments.tuning import ladder, study
+from experiments.tuning.command import settings_of
 from experiments.tuning.evaluation import FIGURES, EvaluationSet, Judge, usual_sets
 from experiments.tuning.ladder import BASELINE, CURVATURE, EVERY, LADDER, OURS, Rung, baseline_of
 from experiments.tuning.settings import LEARNED, usual
@@ -242,6 +244,12 @@ def test_a_study_is_made_read_and_not_made_again(short: Study) -> None:
         "trainings/search-0/weights.json", "judged/few-short/search-0.npz",
     }  # fmt: skip
     np.testing.assert_array_equal(short.read("few, short", "search")["score"], score)
+
+
+@pytest.mark.parametrize("one", EVERY, ids=lambda one: one.label)
+def test_the_command_of_a_rung_asks_for_its_settings(one: Rung) -> None:
+    options = parser().parse_args(one.command(3, 5000).split()[1:])
+    assert settings_of(options) == one.settings(3, 5000)
 
 
 def test_damaged_figures_are_one_line(tmp_path: Path) -> None:

@@ -99,20 +99,25 @@ class Judge:
     def _drive(
         self, envs: PathTrackingVectorEnv, result: Result, by_path: bool
     ) -> dict[str, Array]:
-        settings: dict[str, Any] = {}
-        decider = None
-        if isinstance(result, WeightPolicy):
-            decider = Decider(result.choice, result.layers, envs.single.control_period)
-        else:
-            settings = {"weights": result, "selection": "path" if by_path else "band"}
-        agent: Any = agents.make("lpv-nmpc", envs.single, **settings)
-        loop = ClosedLoop(envs, agent, decider=decider, threads=min(threads(), envs.num_envs))
+        loop = loop_with(result, envs, by_path=by_path)
         loop.reset(seed=0)
         limit = envs.single.task.max_steps
         trace = np.full((envs.num_envs, limit, k.MEMORY_SIZE), np.nan)
         before = envs.memories.copy()
         tally = loop.drive(limit, trace=trace)
         return figures_of(tally, envs, np.concatenate([before[:, None], trace], axis=1))
+
+
+def loop_with(result: Result, envs: PathTrackingVectorEnv, *, by_path: bool = False) -> ClosedLoop:
+    """Closed loop of environments in which a schedule or a policy chooses the weights."""
+    settings: dict[str, Any] = {}
+    decider = None
+    if isinstance(result, WeightPolicy):
+        decider = Decider(result.choice, result.layers, envs.single.control_period)
+    else:
+        settings = {"weights": result, "selection": "path" if by_path else "band"}
+    agent: Any = agents.make("lpv-nmpc", envs.single, **settings)
+    return ClosedLoop(envs, agent, decider=decider, threads=min(threads(), envs.num_envs))
 
 
 def figures_of(tally: Tally, envs: PathTrackingVectorEnv, trace: Array) -> dict[str, Array]:

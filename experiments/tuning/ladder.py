@@ -33,6 +33,12 @@ class Rung:
             conditions=self.conditions,
         )  # fmt: skip
 
+    def command(self, seed: int, solves: int) -> str:
+        """The command that makes the same weights alone."""
+        words = ["lpv-track", "tune", "--method", self.method]
+        words += ["--solves", str(self.factor * solves), "--seed", str(seed)]
+        return " ".join([*words, "--view", self.view, "--conditions", self.conditions])
+
 
 LADDER: tuple[Rung, ...] = (
     Rung("default", "fixed", "default weights"),

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from agents.weight_tuning.files import load
 from experiments.engines import local_pool
 from experiments.tuning.evaluation import FIGURES, EvaluationSet, Judge
-from experiments.tuning.ladder import Rung, rung
+from experiments.tuning.ladder import EVERY, Rung, rung
 from experiments.tuning.loop import PROGRESS, WEIGHTS, Listener, tune
+from lpv_track_env.naming import choose
 from trajectories.atomic import write_atomically
 
 Array = NDArray[Any]
@@ -165,8 +166,7 @@ def run_trainings(study: Study, workers: int) -> Iterator[tuple[int, int]]:
     specs = [
         {
             "folder": str(study.training(one.label, seed)), "label": one.label, "seed": seed,
-            "solves": study.solves,
-            "command": f"lpv-track tuning-study (rung {one.label!r})",
+            "solves": study.solves, "command": one.command(seed, study.solves),
         }
         for one, seed in wanted
     ]  # fmt: skip
@@ -207,7 +207,4 @@ def checked_labels(labels: Sequence[str]) -> tuple[str, ...]:
     ValueError
         Naming the one that is not.
     """
-    from experiments.tuning.ladder import EVERY
-    from lpv_track_env.naming import choose
-
     return tuple(choose("rung", label, tuple(one.label for one in EVERY)) for label in labels)

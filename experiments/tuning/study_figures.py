@@ -7,14 +7,10 @@ import numpy as np
 from matplotlib.ticker import EngFormatter, NullFormatter
 from numpy.typing import NDArray
 
-import agents
-from agents.nmpc.closed_loop import ClosedLoop
-from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.files import load
-from agents.weight_tuning.policy import WeightPolicy
 from agents.weights import TrackingWeights
 from experiments.figures import COLOURS, render
-from experiments.tuning.evaluation import EvaluationSet
+from experiments.tuning.evaluation import EvaluationSet, loop_with
 from experiments.tuning.loop import WEIGHTS
 from experiments.tuning.study import Study
 from experiments.tuning.study_tables import Judged
@@ -80,14 +76,7 @@ def weights_in_use(result: Result, given: EvaluationSet) -> tuple[Array, Array]:
         envs = PathTrackingVectorEnv(
             given.seeds, path, given.vehicle, conditions=given.conditions, **settings
         )
-        decider = None
-        more: dict[str, Any] = {}
-        if isinstance(result, WeightPolicy):
-            decider = Decider(result.choice, result.layers, envs.single.control_period)
-        else:
-            more = {"weights": result}
-        agent: Any = agents.make("lpv-nmpc", envs.single, **more)
-        loop = ClosedLoop(envs, agent, decider=decider)
+        loop = loop_with(result, envs)
         loop.reset(seed=0)
         for _ in range(WINDOWS):
             loop.drive(8)
