@@ -141,7 +141,7 @@ def _realtime(options: argparse.Namespace, console: Any) -> int:
 
 
 def _switching(options: argparse.Namespace, console: Any) -> int:
-    from experiments.tuning.safety_command import run_switching
+    from experiments.tuning.switching_command import run_switching
 
     try:
         return run_switching(options, console)

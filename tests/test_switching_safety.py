@@ -15,8 +15,9 @@ from agents.nmpc.closed_loop import ClosedLoop
 from agents.weight_tuning.choice import SLEW
 from agents.weights import HIGHEST, LOWEST, TrackingWeights
 from experiments import cli
-from experiments.tuning import safety, safety_command
-from experiments.tuning.safety import (
+from experiments.tuning import switching_command
+from experiments.tuning.statistics import failure_bound
+from experiments.tuning.switching import (
     ADVERSARY,
     CONTROL,
     RANDOM,
@@ -29,12 +30,11 @@ from experiments.tuning.safety import (
     arms_of,
     drive_arm,
 )
-from experiments.tuning.safety_summary import (
+from experiments.tuning.switching_summary import (
     summary,
     weights_before_loss,
     widest_kept,
 )
-from experiments.tuning.statistics import failure_bound
 from lpv_track_env import kernels as k
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 
@@ -125,7 +125,7 @@ def test_an_adversary_with_one_draw_is_chance() -> None:
 
 def test_batches_and_threads_change_nothing_but_the_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = outcome_of(Arm(CONTROL))
-    monkeypatch.setattr(safety, "BATCH", 2)
+    monkeypatch.setattr(switching, "BATCH", 2)
     assert_same(outcome_of(Arm(CONTROL)), whole)
 
 
@@ -244,7 +244,7 @@ def test_switching(
         small = Setup(**{**vars(setup), "paths": 2, "time_limit": 1.0})
         return drive_arm(small, arm, tick)
 
-    monkeypatch.setattr(safety_command, "drive_arm", counted)
+    monkeypatch.setattr(switching_command, "drive_arm", counted)
     all_driven: list[str] = []
     for code in (cli.EXIT_INTERRUPTED, cli.EXIT_INTERRUPTED, 0, 0):
         driven.clear()

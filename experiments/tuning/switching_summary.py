@@ -11,8 +11,8 @@ from rich import box
 from rich.table import Table
 
 from agents.weight_tuning.score import failed
-from experiments.tuning.safety import CONTROL, WHOLE, Outcome
 from experiments.tuning.statistics import failure_bound
+from experiments.tuning.switching import CONTROL, WHOLE, Outcome
 from lpv_track_env import kernels as k
 
 Array = NDArray[Any]

@@ -14,8 +14,8 @@ from agents.weights import HIGHEST, LOWEST, TrackingWeights
 from experiments.benchmark import progress_bar
 from experiments.cases import project_digest
 from experiments.results import hardware, revision, versions
-from experiments.tuning.safety import BATCH, WHOLE, WINDOW, Setup, arms_of, drive_arm
-from experiments.tuning.safety_summary import summary, table, widest_kept
+from experiments.tuning.switching import BATCH, WHOLE, WINDOW, Setup, arms_of, drive_arm
+from experiments.tuning.switching_summary import summary, table, widest_kept
 from lpv_track_env import conditions
 from lpv_track_env.threads import checked_threads
 from trajectories.atomic import write_atomically
@@ -101,7 +101,7 @@ def run_switching(options: argparse.Namespace, console: Console) -> int:
 def _sources() -> str:
     """Digest of what a result depends on."""
     here = Path(__file__).parent
-    own = "".join((here / f"{name}.py").read_text() for name in ("safety", "safety_summary"))
+    own = "".join((here / f"{name}.py").read_text() for name in ("switching", "switching_summary"))
     return hashlib.sha256((project_digest() + own).encode()).hexdigest()[:16]
 
 
