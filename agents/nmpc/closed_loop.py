@@ -87,6 +87,8 @@ class ClosedLoop:
     ------
     ValueError
         For another autoreset mode, an agent for another layout, or an impossible number of threads.
+    TypeError
+        For an agent that is not `lpv-nmpc`, with delay compensation around it or not.
 
     Examples
     --------

@@ -115,13 +115,16 @@ class WeightLearnerVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Refuse: settings are the constructor's."""
-        raise NotImplementedError(f"{attr_name} is set when the environments are made")
+        raise AttributeError(f"cannot set {attr_name!r}: it is set when the environments are made")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Refuse: the environments are one."""
-        raise NotImplementedError(f"{method_name}: the environments are one, in compiled code")
+        """Refuse: the environments are one, and have no methods of their own."""
+        raise AttributeError(
+            f"cannot call {method_name!r} of each: the environments are one, in compiled code; "
+            "call it on `envs`"
+        )
 
     def env_is_wrapped(
         self,
