@@ -15,7 +15,7 @@ from agents.nmpc.closed_loop import ClosedLoop
 from agents.weight_tuning.choice import SLEW
 from agents.weights import HIGHEST, LOWEST, TrackingWeights
 from experiments import cli
-from experiments.tuning import switching_command
+from experiments.tuning import switching, switching_command
 from experiments.tuning.statistics import failure_bound
 from experiments.tuning.switching import (
     ADVERSARY,

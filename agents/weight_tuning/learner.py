@@ -113,12 +113,16 @@ class WeightLearnerVecEnv(VecEnv):
         value = getattr(self.envs, attr_name)
         return [value for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:  # noqa: ARG002
         """Refuse: settings are the constructor's."""
         raise AttributeError(f"cannot set {attr_name!r}: it is set when the environments are made")
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+        self,
+        method_name: str,
+        *method_args: Any,  # noqa: ARG002
+        indices: Any = None,  # noqa: ARG002
+        **method_kwargs: Any,  # noqa: ARG002
     ) -> list[Any]:
         """Refuse: the environments are one, and have no methods of their own."""
         raise AttributeError(
