@@ -26,6 +26,7 @@ SMALL: dict[str, tuple[list[str], int]] = {
     "gradient": (["--set", "pairs=2"], 4 * 10),
     "catalogue": (["--drives", "2", "--set", *PPO], 2 * 4 * 8),
     "rl": (["--drives", "2", "--set", *PPO], 2 * 4 * 8),
+    "paired": (["--drives", "4"], 4 * 8),
 }
 STEPS = 3
 

@@ -19,15 +19,18 @@ from experiments import cli
 from experiments.training import checkpoint
 from experiments.training.lock import alone_in
 from experiments.tuning import loop
+from experiments.tuning.paired import STATE as PAIRED
 from experiments.tuning.search import STATE
 from experiments.tuning.tuner import Tuner
 from lpv_track_env.vehicle import VEHICLES
 
-RESUMED = ("search", "paper", "gradient", "rl")
+RESUMED = ("search", "paper", "gradient", "rl", "paired")
 """Those whose files differ in kind."""
 
 
 def state_of(method: str) -> str:
+    if method == "paired":
+        return PAIRED
     return checkpoint.NAME if method in {"rl", "catalogue"} else STATE
 
 

@@ -60,6 +60,21 @@ def parts_of(tally: Tally) -> Array:
     return parts
 
 
+def rms_so_far(squares: Array, steps: Array, periods: int) -> Array:
+    """Root mean squares of drives, (n, 5), after `USUAL_WINDOWS` of usual driving.
+
+    Parameters
+    ----------
+    squares, steps
+        Sums of squares (n, 5) over control periods (n,).
+    periods
+        Control periods of a whole window.
+    """
+    before = float(USUAL_WINDOWS * periods)
+    rms: Array = np.sqrt((before * USUAL**2 + squares) / (before + steps[:, None]))
+    return rms
+
+
 def marginal_parts(window: Tally, drive: Tally, periods: int) -> Array:
     """What a window adds to the parts of its drive's score, (n, 5), a part to a usual window.
 
@@ -78,8 +93,7 @@ def marginal_parts(window: Tally, drive: Tally, periods: int) -> Array:
         Control periods of a whole window.
     """
     steps = np.maximum(window.steps, 1.0)[:, None]
-    before = float(USUAL_WINDOWS * periods)
-    rho = np.sqrt((before * USUAL**2 + squares_of(drive)) / (before + drive.steps[:, None]))
+    rho = rms_so_far(squares_of(drive), drive.steps, periods)
     parts: Array = 0.5 * (squares_of(window) / steps / rho + rho) / SCALES
     return parts
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from experiments.benchmark import parse_settings, progress_bar
-from experiments.tuning.settings import LEARNED, TuningSettings, usual
+from experiments.tuning.settings import PPO_METHODS, TuningSettings, usual
 
 PLAIN = (
     "vehicle", "conditions", "conditions_set", "trajectories", "paths", "drives", "time_limit",
@@ -129,7 +129,7 @@ def _need(method: str) -> None:
         One line that names the extra.
     """
     needed = {"search": ("cma", "tune"), "bands": ("cma", "tune"), "paper": ("cma", "tune")}
-    if method in LEARNED:
+    if method in PPO_METHODS:
         needed[method] = ("stable_baselines3", "rl")
     if method in needed and find_spec(needed[method][0]) is None:
         package, extra = needed[method]

@@ -6,7 +6,9 @@ from experiments.tuning.settings import TuningSettings, usual
 
 BASELINE = "search x10"
 """The best fixed set, at ten times the others' budget: what every gain is over."""
-OURS = "rl"
+OURS = "paired"
+"""Of our own; and by a library's PPO:"""
+PPO = "rl"
 
 
 @dataclass(frozen=True)
@@ -48,9 +50,10 @@ LADDER: tuple[Rung, ...] = (
     Rung("bands", "bands", "a set a band, CMA-ES"),
     Rung("gradient", "gradient", "a set a band, gradients of the closed loop"),
     Rung("catalogue", "catalogue", "PPO chooses of 25 sets"),
-    Rung(OURS, "rl", "PPO multiplies weights"),
-    Rung("rl, path", "rl", "the same, shown curvature alone", view="path"),
-    Rung("rl, drive", "rl", "the same, shown the drive's history alone", view="drive"),
+    Rung(PPO, "rl", "PPO multiplies weights"),
+    Rung(OURS, "paired", "a linear policy multiplies weights, learned from pairs of drives"),
+    Rung("paired, path", "paired", "the same, shown curvature alone", view="path"),
+    Rung("paired, drive", "paired", "the same, shown the drive's history alone", view="drive"),
 )
 CURVATURE: tuple[Rung, ...] = (
     Rung(f"{BASELINE}, simulation", "search", "best fixed set without disturbances", 10,
@@ -59,6 +62,8 @@ CURVATURE: tuple[Rung, ...] = (
          conditions="simulation"),
     Rung("rl, simulation", "rl", "PPO shown curvature alone, without disturbances", view="path",
          conditions="simulation"),
+    Rung("paired, simulation", "paired", "a linear policy shown curvature alone, without them",
+         view="path", conditions="simulation"),
 )  # fmt: skip
 """Curvature alone: nothing differs between drives but the path."""
 EVERY = (*LADDER, *CURVATURE)

@@ -13,7 +13,7 @@ from experiments.interrupts import Interrupts
 from experiments.results import hardware, revision, versions
 from experiments.training.lock import alone_in
 from experiments.tuning.drives import load_paths, path_names
-from experiments.tuning.settings import LEARNED, TuningSettings
+from experiments.tuning.settings import PPO_METHODS, TuningSettings
 from experiments.tuning.tuner import Result, Tuner
 from lpv_track_env import vehicle
 from trajectories import CurvatureBands, ReferencePath
@@ -34,7 +34,7 @@ class Listener:
 
 def make_tuner(settings: TuningSettings, paths: list[ReferencePath]) -> Tuner:
     """The tuner of a method, on its paths."""
-    if settings.method in LEARNED:
+    if settings.method in PPO_METHODS:
         from experiments.tuning.learning import PolicyLearning
 
         return PolicyLearning(settings, paths)
@@ -43,6 +43,10 @@ def make_tuner(settings: TuningSettings, paths: list[ReferencePath]) -> Tuner:
         from experiments.tuning.gradient import GradientSearch
 
         return GradientSearch(settings, paths, rows)
+    if settings.method == "paired":
+        from experiments.tuning.paired import PairedLearning
+
+        return PairedLearning(settings, paths)
     if settings.method == "paper":
         from experiments.tuning.by_path import PathClassSearch
 

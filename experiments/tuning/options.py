@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-METHODS = ("fixed", "paper", "search", "bands", "gradient", "catalogue", "rl")
+METHODS = ("fixed", "paper", "search", "bands", "gradient", "catalogue", "rl", "paired")
 
 
 def add_tuning_options(tune: argparse.ArgumentParser) -> None:
@@ -13,7 +13,8 @@ def add_tuning_options(tune: argparse.ArgumentParser) -> None:
         help="fixed: the default weights; paper: a set by the path's sharpest curvature; search: "
         "the best fixed set, by CMA-ES; bands: a set a band of curvature, by CMA-ES; gradient: the "
         "same by gradients of the closed loop; catalogue: PPO chooses sets while driving; rl: PPO "
-        "multiplies weights while driving",
+        "multiplies weights while driving; paired: a linear policy does, learned from drives "
+        "alike but for their weights",
     )  # fmt: skip
     tune.add_argument("--out", type=Path, metavar="DIR", help="default: results/tune/METHOD")
     tune.add_argument(
@@ -40,7 +41,8 @@ def add_tuning_options(tune: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     tune.add_argument(
         "--drives", type=int, metavar="N",
-        help="drives that judge a candidate (default 16), environments of PPO (default 64)",
+        help="drives that judge a candidate (default 16), environments of PPO (default 64), drives "
+        "of paired (default 32)",
     )  # fmt: skip
     tune.add_argument(
         "--time-limit", type=float, metavar="S", help="of a drive (default 10 s, PPO 20 s)"

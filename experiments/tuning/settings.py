@@ -24,8 +24,10 @@ METHODS: dict[str, str] = {
     "gradient": "the same by gradients: differences of drives alike but for their weights",
     "catalogue": "PPO chooses a set of a catalogue, every window",
     "rl": "PPO multiplies the weights of the band at hand, every window",
+    "paired": "a linear policy does, learned from drives alike but for their weights",
 }
-LEARNED = ("catalogue", "rl")
+PPO_METHODS = ("catalogue", "rl")
+LEARNED = (*PPO_METHODS, "paired")
 """Methods whose result is a weight policy; that of the others is a schedule."""
 
 PPO: dict[str, Any] = {
@@ -41,9 +43,21 @@ HYPERPARAMETERS: dict[str, dict[str, Any]] = {
     "gradient": {"sigma": 0.3, "learning_rate": 0.4, "pairs": 16},
     "catalogue": PPO,
     "rl": PPO,
+    "paired": {
+        "deviation": 0.15,
+        "hold": 5,
+        "curvature": 0.5,
+        "response": 0.02,
+        "least_curvature": 0.2,
+        "half_life": 1.0,
+        "step": 0.5,
+    },
 }
 """Defaults of `--set`. `sigma`: first standard deviation of candidates' log-multipliers; `pairs` of
-drives a step; `segment` solves between checkpoints."""
+drives a step; `segment` solves between checkpoints.
+Of `paired`: `deviation` of an action's offsets, each held for `hold` windows; `curvature` and
+`response` of the prior, `least_curvature` of the cost (`quadratic`); `half_life` of a pair, in
+budgets; `step` towards the best policy of a fit."""
 
 
 @dataclass(frozen=True)
@@ -138,8 +152,10 @@ def usual(method: str, **changes: Any) -> TuningSettings:
     """
     choose("method", method, tuple(METHODS))
     given = {key: value for key, value in changes.items() if value is not None}
-    if method in LEARNED:
+    if method in PPO_METHODS:
         given = {"drives": 64, "time_limit": 20.0, **given}
+    if method == "paired":
+        given = {"drives": 32, **given}
     return TuningSettings(method, **given)
 
 

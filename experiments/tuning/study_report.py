@@ -10,7 +10,7 @@ from experiments.report_page import PAGE
 from experiments.results import hardware, revision, versions
 from experiments.tuning import study_figures as figures
 from experiments.tuning import study_tables as tables
-from experiments.tuning.ladder import BASELINE, OURS
+from experiments.tuning.ladder import BASELINE, OURS, PPO
 from experiments.tuning.oracle import Headroom
 from experiments.tuning.study import Study
 from trajectories.atomic import write_atomically
@@ -54,9 +54,8 @@ def write_report(
     body.append(_section("Every set", html_table(headings, lines, range(1, len(headings)))))
     for given in study.sets:
         if given.name.startswith("six"):
-            some = [
-                label for label in ("default", "paper", BASELINE, OURS) if label in study.labels
-            ]
+            compared = ("default", "paper", BASELINE, PPO, OURS)
+            some = [label for label in compared if label in study.labels]
             body.append(
                 _section(
                     f"In the paper's terms: {given.name}",
@@ -111,7 +110,7 @@ def _pictures(study: Study, rows: list[tables.Judged], greedy: float | None) -> 
     pictures = {"Scores of what was tried": figures.learning_curves(study, labels)}
     if greedy is not None:
         pictures["Regret against solves"] = figures.regret(rows, greedy)
-    some = [label for label in ("bands", "gradient", OURS) if label in labels]
+    some = [label for label in ("bands", "gradient", PPO, OURS) if label in labels]
     if some:
         pictures["Weights in use by band of curvature"] = figures.weights_over_curvature(
             study, some, study.sets[0]
