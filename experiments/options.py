@@ -120,7 +120,7 @@ def _speed(add: Add) -> None:
     speed.add_argument(
         "--only", nargs="+", default=[], metavar="SECTION",
         help="default: all of single, vector, conditions, learning, training, solvers, policies, "
-        "horizons, batches, wild, loops, memory, startup",
+        "horizons, batches, wild, loops, tuning, memory, startup",
     )  # fmt: skip
     speed.add_argument("--quick", action="store_true", help="tiny: shows that it works, no more")
 
@@ -168,8 +168,13 @@ def _switching(add: Add) -> None:
     )
     switching.add_argument(
         "--spans", nargs="+", default=["10", "100", "1000", "whole"], metavar="FACTOR",
-        help="how far weights are drawn from the default ones (default 10 100 1000 whole: the "
+        help="how far weights are drawn from the base ones (default 10 100 1000 whole: the "
         "whole bounds of weights)",
+    )  # fmt: skip
+    switching.add_argument(
+        "--weights", type=Path, metavar="FILE",
+        help="schedule of one set to switch around, as of tune --method search (default: the "
+        "default weights)",
     )  # fmt: skip
     switching.add_argument(
         "--candidates", type=int, default=4, metavar="K",

@@ -33,7 +33,7 @@ from experiments.speed.measure import (
     interleave,
 )
 
-MEASURED = ["single", "vector", "solvers", "batches"]
+MEASURED = ["single", "vector", "solvers", "batches", "tuning"]
 
 
 def quietly(text: str) -> None:

@@ -13,7 +13,7 @@ from scipy.stats import binom
 import agents
 from agents.nmpc.closed_loop import ClosedLoop
 from agents.weight_tuning.choice import SLEW
-from agents.weights import HIGHEST, LOWEST, TrackingWeights
+from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
 from experiments import cli
 from experiments.tuning import switching, switching_command
 from experiments.tuning.statistics import failure_bound
@@ -37,6 +37,7 @@ from experiments.tuning.switching_summary import (
 )
 from lpv_track_env import kernels as k
 from lpv_track_env.vector_env import PathTrackingVectorEnv
+from trajectories import CurvatureBands
 
 SMALL = Setup(episodes=5, paths=3, time_limit=2.0, candidates=3)
 BASE = TrackingWeights().as_array()
@@ -60,7 +61,7 @@ def assert_same(one: Outcome, other: Outcome) -> None:
 
 @pytest.mark.parametrize("span", [10.0, 1000.0, WHOLE])
 def test_draws_fill_their_bounds_evenly_in_logarithms(span: float) -> None:
-    sets = Arm(RANDOM, span).draw(np.random.default_rng(0), 4000)
+    sets = Arm(RANDOM, span).draw(np.random.default_rng(0), 4000, BASE)
     low = np.full(8, LOWEST) if span == WHOLE else BASE[:8] / span
     high = np.full(8, HIGHEST) if span == WHOLE else BASE[:8] * span
     share = np.log(sets[:, :8] / low) / np.log(high / low)
@@ -78,7 +79,7 @@ def test_arms_are_the_control_and_both_ways_with_the_slew_limit_and_without() ->
     assert arms[0].mode == CONTROL
     assert len({arm.label for arm in arms}) == len(arms) == 9
     assert {arm.slew for arm in arms[1:]} == {SLEW, math.inf}
-    sets = arms[0].draw(np.random.default_rng(0), 3)
+    sets = arms[0].draw(np.random.default_rng(0), 3, BASE)
     np.testing.assert_array_equal(sets, np.tile(BASE, (3, 1)))
 
 
@@ -91,7 +92,7 @@ def test_weights_in_use_keep_to_the_slew_limit_and_reach_what_is_drawn(slew: flo
     if slew < math.inf:
         assert np.nanmax(change) <= slew * WINDOW * (1.0 + 1e-4)
     rng = np.random.default_rng([SMALL.seed, 0])
-    drawn = np.array([np.log(arm.draw(rng, 5)[:, :8] / BASE[:8]) for _ in range(5)])
+    drawn = np.array([np.log(arm.draw(rng, 5, BASE)[:, :8] / BASE[:8]) for _ in range(5)])
     # At once in the first window, whatever the limit.
     known = 1 if slew < math.inf else 5
     np.testing.assert_allclose(used.swapaxes(0, 1)[:known], drawn[:known], atol=1e-4)
@@ -135,7 +136,7 @@ def test_the_adversary_follows_the_worst_branch() -> None:
     short = Setup(episodes=2, paths=3, time_limit=windows * WINDOW, candidates=count)
     found = outcome_of(arm, short)
     rng = np.random.default_rng([0, 0])
-    draws = [arm.draw(rng, 2 * count).reshape(2, count, 10) for _ in range(windows)]
+    draws = [arm.draw(rng, 2 * count, BASE).reshape(2, count, 10) for _ in range(windows)]
     for episode in range(2):
         taken: list[Any] = []
         for sets in draws:
@@ -294,3 +295,27 @@ def test_help_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
         cli.main(["switching", "--help"])
     assert ended.value.code == 0
     assert "example: lpv-track switching " in capsys.readouterr().out
+
+
+def test_other_weights_are_switched_around() -> None:
+    base = TrackingWeights(Q=(LOWEST, 1.0, 2.0, 2.0), S=(1.0, HIGHEST, 3.0, 3.0))
+    sets = Arm(RANDOM, 10.0).draw(np.random.default_rng(0), 2000, base.as_array())
+    assert sets.min(axis=0)[[0, 2]] == pytest.approx([LOWEST, 0.2], rel=0.02)
+    assert sets.max(axis=0)[[2, 5]] == pytest.approx([20.0, HIGHEST], rel=0.02)
+    assert sets.min() >= LOWEST
+    assert sets.max() <= HIGHEST
+    other = Setup(**{**vars(SMALL), "weights": base})
+    kept, usual = outcome_of(Arm(CONTROL), other), outcome_of(Arm(CONTROL))
+    np.testing.assert_allclose(kept.used[kept.steps > 36], 0.0, atol=1e-6)
+    assert (kept.lateral_square != usual.lateral_square).all()
+
+
+def test_a_file_of_the_base_weights(tmp_path: Path) -> None:
+    base = TrackingWeights(Q=(0.5, 1.0, 2.0, 2.0))
+    bands = CurvatureBands()
+    WeightSchedule(bands, (base,) * 4).write(tmp_path / "one.json")
+    assert switching_command.base_of(tmp_path / "one.json") == base
+    assert switching_command.base_of(None) == TrackingWeights()
+    WeightSchedule(bands, (base, base, base, TrackingWeights())).write(tmp_path / "four.json")
+    with pytest.raises(ValueError, match=r"four\.json holds no single set"):
+        switching_command.base_of(tmp_path / "four.json")

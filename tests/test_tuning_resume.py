@@ -1,5 +1,6 @@
 """A tuning that was interrupted, killed or damaged: it goes on bit for bit, or says why not."""
 
+import io
 import json
 import os
 import signal
@@ -8,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from small_tunings import SMALL, STEPS, Counted, bits, progress, refusal, tuned, words
 
@@ -158,6 +160,21 @@ def test_a_state_that_cannot_be_used_is_one_line_and_its_advice_helps(
             json.dumps({**other, "solves": None, "straight": None}),
         ]  # fmt: skip
         bad = [*(text.encode() for text in texts), b"\xff\xfe", bytes(100)]
+    elif file.name == PAIRED:
+        with np.load(io.BytesIO(good)) as content:
+            arrays = dict(content)
+        numbers = arrays["numbers"]
+        foreign = [
+            {}, {**arrays, "policy": arrays["policy"][:1]}, {**arrays, "numbers": numbers[:-1]},
+            {**arrays, "squares": np.nan * arrays["squares"]},
+            {**arrays, "mean": arrays["mean"].astype(object)},
+            {**arrays, "numbers": numbers.astype(np.int64)},
+        ]  # fmt: skip
+        bad = [b"", good[: len(good) // 2], b"{}", bytes(100)]
+        for content in foreign:
+            buffer = io.BytesIO()
+            np.savez(buffer, **content)
+            bad.append(buffer.getvalue())
     else:
         kept = torch.load(file, weights_only=True)
         bad = [b"", good[:-1], good[: len(good) // 2], b"{}"]

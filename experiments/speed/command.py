@@ -53,6 +53,7 @@ SECTIONS: dict[str, tuple[str, Measure]] = {
     "batches": ("NMPC on batches of observations", solvers.batches),
     "wild": ("The real-time NMPC on wild observations", wild.wild),
     "loops": ("Closed loops in compiled code", loops.loops),
+    "tuning": ("Decisions on the NMPC's weights", loops.tuning),
     "memory": ("Memory of fresh processes", processes.memory),
     "startup": ("Start-up of fresh processes", processes.startup),
 }

@@ -147,6 +147,12 @@ def _loops(section: Result, ax: Axes) -> None:
     ax.set_ylabel("µs per environment and control period")
 
 
+def _tuning(section: Result, ax: Axes) -> None:
+    _lines(section, ax, "n", 1e6)
+    _doubling(ax, "environments in a call")
+    ax.set_ylabel("µs per decision")
+
+
 PANELS: dict[str, Callable[[Result, Axes], None]] = {
     "single": _single,
     "vector": _vector,
@@ -154,5 +160,6 @@ PANELS: dict[str, Callable[[Result, Axes], None]] = {
     "horizons": _horizons,
     "batches": _batches,
     "loops": _loops,
+    "tuning": _tuning,
 }
 """What draws a section."""

@@ -1,4 +1,4 @@
-"""Section of the closed loop: many environments, each with its NMPC and its weights."""
+"""Sections of the closed loop: many environments, each with its NMPC and its weights."""
 
 import time
 
@@ -6,6 +6,8 @@ import numpy as np
 
 import agents
 from agents.nmpc.closed_loop import ClosedLoop
+from agents.weight_tuning.vector_env import WeightTuningVectorEnv
+from experiments.speed import peers
 from experiments.speed.measure import Effort, Section, Tick, calibrated, interleave
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 
@@ -36,6 +38,34 @@ def loops(section: Section, effort: Effort, tick: Tick) -> None:
             run = Driving(loop)
             once = calibrated(run, effort.round_seconds)
             pairs.append((series, lambda run=run, once=once: once() / run.periods))
+        interleave(pairs, effort.rounds)
+        for series, _ in pairs[1:]:
+            section.compare(series, pairs[0][0])
+
+
+def tuning(section: Section, effort: Effort, tick: Tick) -> None:
+    """Decisions on weights, of `WeightTuning-v0`."""
+    section.notes.append(
+        "Seconds per decision on the NMPC's weights in WeightTuningVectorEnv: step() with random "
+        "actions, up to 8 control periods (0.4 s) of estimator, delay compensation, NMPC and plant "
+        f"under `randomised`, on {' and '.join(effort.trajectories)}; episodes begin anew in "
+        "the clock."
+    )
+    for n in effort.batches:
+        pairs = []
+        for threads in effort.threads:
+            if threads > n:
+                continue
+            tick(f"weight tuning: {n} environments, {threads} threads")
+            series = section.add("WeightTuning-v0", "s/decision", n=n, threads=threads)
+            envs = WeightTuningVectorEnv(
+                n, list(effort.trajectories), conditions="randomised", random_start=True,
+                autoreset_mode="SameStep", threads=threads,
+            )  # fmt: skip
+            envs.action_space.seed(0)
+            run = peers.stepping(envs, np.stack([envs.action_space.sample() for _ in range(16)]))
+            once = calibrated(run, effort.round_seconds)
+            pairs.append((series, lambda once=once: once() / n))  # noqa: B023
         interleave(pairs, effort.rounds)
         for series, _ in pairs[1:]:
             section.compare(series, pairs[0][0])

@@ -25,7 +25,7 @@ WINDOW = 0.4
 TIME_LIMIT = 20.0
 BATCH = 250
 """Episodes at once."""
-CONTROL, RANDOM, ADVERSARY = "default weights", "random", "adversary"
+CONTROL, RANDOM, ADVERSARY = "not switched", "random", "adversary"
 WHOLE = math.inf
 """Span of the whole bounds of weights."""
 
@@ -37,12 +37,12 @@ class Arm:
     Parameters
     ----------
     mode
-        `CONTROL`: the default weights throughout; `RANDOM`: Q and S drawn anew in every window;
+        `CONTROL`: the base weights throughout; `RANDOM`: Q and S drawn anew in every window;
         `ADVERSARY`: that one of several draws under which the window's largest lateral error turns
         out worst, whatever comes of it later.
     span
-        Each of Q and S is drawn by itself, log-uniformly, from the default divided by it to the
-        default times it; `WHOLE`: from the bounds of weights.
+        Each of Q and S is drawn by itself, log-uniformly, from the base weight divided by it to
+        that times it; `WHOLE`: from the bounds of weights.
     slew
         Largest change of a weight's logarithm, 1/s.
     """
@@ -66,16 +66,16 @@ class Arm:
             "mode": self.mode, "span": span, "slew": None if self.slew == math.inf else self.slew,
         }  # fmt: skip
 
-    def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Sets of weights, (count, 10)."""
-        base = TrackingWeights().as_array()
+    def draw(self, rng: np.random.Generator, count: int, base: Array) -> Array:
+        """Sets of weights, (count, 10), around the base (10,)."""
         sets = np.tile(base, (count, 1))
         if self.mode == CONTROL:
             return sets
         if self.span == WHOLE:
             low, high = np.full(TUNED, LOWEST), np.full(TUNED, HIGHEST)
         else:
-            low, high = base[:TUNED] / self.span, base[:TUNED] * self.span
+            low = np.maximum(base[:TUNED] / self.span, LOWEST)
+            high = np.minimum(base[:TUNED] * self.span, HIGHEST)
         sets[:, :TUNED] = np.exp(rng.uniform(np.log(low), np.log(high), (count, TUNED)))
         return sets
 
@@ -103,6 +103,8 @@ class Setup:
     candidates: int = 4
     """Draws that the adversary chooses from."""
     seed: int = 0
+    weights: TrackingWeights = field(default_factory=TrackingWeights)
+    """Base weights."""
     threads: int = 1
 
     def __post_init__(self) -> None:
@@ -139,7 +141,7 @@ class Outcome:
     not_finite: Array
     """Whether a number of the vehicle, its action or its weights ever was not finite."""
     used: Array
-    """ln(Q, S in use / default) at the end of each window, (episodes, windows, 8); NaN after."""
+    """ln(Q, S in use / base) at the end of each window, (episodes, windows, 8); NaN after."""
     statuses: Counter[str] = field(default_factory=Counter)
     """Failed solves by status, and what replaced them."""
 
@@ -158,7 +160,7 @@ class Branches:
         agent: Any = agents.make("lpv-nmpc", envs.single)
         self.loop = ClosedLoop(envs, agent, slew=arm.slew, threads=min(setup.threads, n))
         self.window = max(round(WINDOW / envs.single.control_period), 1)
-        self.base = TrackingWeights().as_array()[:TUNED]
+        self.base = setup.weights.as_array()
 
     def drive(
         self, setup: Setup, first: int, rng: np.random.Generator, tick: Callable[[], None]
@@ -176,14 +178,16 @@ class Branches:
                 for _ in range(window, setup.windows):
                     tick()
                 break
-            tally = np.array(loop.drive(self.window, self.arm.draw(rng, n * self.count)))
+            tally = np.array(loop.drive(self.window, self.arm.draw(rng, n * self.count, self.base)))
             chosen = self._worst(Tally(*tally))
             sums += np.where(running, tally[:, chosen], 0.0)
             largest = np.fmax(largest, np.where(running, Tally(*tally).max_lateral[chosen], 0.0))
             nmpc = loop.memory.nmpc
             numbers = [loop.envs.memories[chosen], nmpc.actions[chosen], nmpc.weights[chosen]]
             not_finite |= ~np.isfinite(np.concatenate(numbers, axis=1)).all(axis=1)
-            used[running, window] = np.log(nmpc.weights[chosen, :TUNED] / self.base)[running]
+            used[running, window] = np.log(nmpc.weights[chosen, :TUNED] / self.base[:TUNED])[
+                running
+            ]
             self._follow(chosen, running)
             tick()
         total = Tally(*sums)

@@ -10,7 +10,8 @@ from typing import Any
 
 from rich.console import Console
 
-from agents.weights import HIGHEST, LOWEST, TrackingWeights
+from agents.weight_tuning.files import load
+from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
 from experiments.benchmark import progress_bar
 from experiments.cases import project_digest
 from experiments.results import hardware, revision, versions
@@ -45,6 +46,22 @@ def spans_of(given: list[str]) -> tuple[float, ...]:
     return tuple(dict.fromkeys(spans))
 
 
+def base_of(file: Path | None) -> TrackingWeights:
+    """The one set of a schedule's file; the default one where there is none.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be read, or holds a policy or several sets.
+    """
+    if file is None:
+        return TrackingWeights()
+    result = load(file)
+    if not isinstance(result, WeightSchedule) or len(set(result.weights)) != 1:
+        raise ValueError(f"{file} holds no single set of weights to switch around")
+    return result.weights[0]
+
+
 def run_switching(options: argparse.Namespace, console: Console) -> int:
     """Drive every arm, print the table, write `switching.json`; arms that are there are kept.
 
@@ -55,19 +72,21 @@ def run_switching(options: argparse.Namespace, console: Console) -> int:
     """
     setup = Setup(
         episodes=options.episodes, conditions=options.conditions, vehicle=options.vehicle,
-        candidates=options.candidates, seed=options.seed, threads=checked_threads(options.threads),
+        candidates=options.candidates, seed=options.seed, weights=base_of(options.weights),
+        threads=checked_threads(options.threads),
     )  # fmt: skip
     conditions.load(setup.conditions)
     arms = arms_of(spans_of(options.spans))
     options.out.mkdir(parents=True, exist_ok=True)
     file: Path = options.out / "switching.json"
-    plain = {key: value for key, value in dataclasses.asdict(setup).items() if key != "threads"}
+    # As JSON gives it back: what is kept is compared with it.
+    plain = json.loads(json.dumps(dataclasses.asdict(setup)))
+    del plain["threads"]
     result: dict[str, Any] = {
         "experiment": "switching",
         "setup": plain,
         "window": WINDOW,
         "bounds": [LOWEST, HIGHEST],
-        "default_weights": dataclasses.asdict(TrackingWeights()),
         "trajectories": setup.trajectories,
         "sources": _sources(),
         "revision": revision(),

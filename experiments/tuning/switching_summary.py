@@ -52,7 +52,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
 def weights_before_loss(outcome: Outcome) -> Mapping[str, Any]:
     """How weights were in the last windows of lost episodes, and otherwise.
 
-    Of log10(weight / default), of its mean over the four weights on position and of differences:
+    Of log10(weight / base), of its mean over the four weights on position and of differences:
     mean before a loss, mean and standard deviation over all windows.
     """
     lost = failed(outcome.ends)
@@ -79,8 +79,8 @@ def table(result: Mapping[str, Any]) -> Table:
     """An arm a row."""
     setup = result["setup"]
     shown = Table(
-        title=f"default weights, or Q and S switched every {result['window']:g} s within a span "
-        f"around them; {setup['conditions']}, {setup['episodes']} episodes a row",
+        title=f"Q and S switched every {result['window']:g} s within a span "
+        f"around base weights; {setup['conditions']}, {setup['episodes']} episodes a row",
         title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False,
     )  # fmt: skip
     shown.add_column("weights, span", no_wrap=True)
