@@ -48,10 +48,17 @@ class EvaluationSet:
 
 
 def usual_sets(seeds: int) -> list[EvaluationSet]:
-    """Held-out random paths, the paper's six, and their raw waypoints."""
+    """Held-out random paths, also with less to hinder, the paper's six, and their raw waypoints."""
     return [
         EvaluationSet("held-out", HELD_OUT, seeds=seeds),
         EvaluationSet("held-out, simulation", HELD_OUT, "simulation", 1),
+        # Whatever weights are, no controller knows its state better than this.
+        EvaluationSet(
+            "held-out, perfect sensors",
+            HELD_OUT,
+            {"name": "randomised", "estimator": "truth"},
+            min(seeds, 2),
+        ),
         EvaluationSet("six, realtime", SIX, "realtime", seeds),
         EvaluationSet("six, simulation", SIX, "simulation", 1),
         EvaluationSet("raw waypoints, realtime", RAW, "realtime", seeds, env_settings=RAW_PREVIEW),
