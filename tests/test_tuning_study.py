@@ -144,7 +144,7 @@ def test_a_drive_that_fails_scores_as_one() -> None:
 
 def test_evaluation_sets_are_of_paths_that_tuning_refuses() -> None:
     for given in usual_sets(3):
-        assert given.seeds in {1, 3}
+        assert given.seeds in {1, 2, 3}
         assert given.labels == given.trajectories
         for name in given.labels:
             with pytest.raises(ValueError, match="evaluation"):
