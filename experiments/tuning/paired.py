@@ -29,7 +29,7 @@ from experiments.tuning.choices import choice_of
 from experiments.tuning.drives import Array, threads
 from experiments.tuning.quadratic import PairedQuadratic, Prior
 from experiments.tuning.settings import TuningSettings
-from experiments.tuning.tuner import Tuner
+from experiments.tuning.tuner import Tuner, unusable
 from lpv_track_env import vehicle
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import ReferencePath
@@ -224,16 +224,11 @@ class PairedLearning(Tuner):
                 if not np.isfinite(given).all():
                     raise ValueError(f"its {name} is not finite")
         except KeyError as error:
-            raise ValueError(_useless(file, str(error))) from None
+            raise ValueError(unusable(file, str(error))) from None
         except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(_useless(file, str(error))) from None
+            raise ValueError(unusable(file, str(error))) from None
         self.policy, self._mean = kept["policy"], kept["mean"]
         model.squares, model.products = kept["squares"], kept["products"]
         averaged, rounds, solves, model.count, model.total, model.noise = kept["numbers"].tolist()
         self._averaged, self._rounds, self._solves = int(averaged), int(rounds), int(solves)
         return True
-
-
-def _useless(file: Path, reason: str) -> str:
-    reason = " ".join(reason.split())
-    return f"{file} cannot be used ({reason}): remove it, and the tuning begins anew"

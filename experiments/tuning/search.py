@@ -20,7 +20,7 @@ from agents.weight_tuning.choice import DIRECTIONS, SLEW
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments.tuning.drives import TuningDrives, weights_at
 from experiments.tuning.settings import TuningSettings
-from experiments.tuning.tuner import Tuner
+from experiments.tuning.tuner import Tuner, unusable
 from trajectories import CurvatureBands, ReferencePath
 from trajectories.atomic import write_atomically
 
@@ -206,15 +206,10 @@ def restore_state(folder: Path, play: Callable[[Any], None]) -> bool:
             raise ValueError(f"its format is {content['format']!r}, not {FORMAT!r}")
         play(content)
     except KeyError as error:
-        raise ValueError(_useless(file, f"no {error} in it")) from None
+        raise ValueError(unusable(file, f"no {error} in it")) from None
     except (OSError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise ValueError(_useless(file, str(error))) from None
+        raise ValueError(unusable(file, str(error))) from None
     return True
-
-
-def _useless(file: Path, reason: str) -> str:
-    reason = " ".join(reason.split())
-    return f"{file} cannot be used ({reason}): remove it, and the tuning begins anew"
 
 
 def evolution(settings: TuningSettings, size: int, seed: int) -> Any:

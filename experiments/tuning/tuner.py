@@ -54,3 +54,9 @@ class Tuner(ABC):
         ValueError
             In one line, if the file cannot be used.
         """
+
+
+def unusable(file: Path, reason: str) -> str:
+    """What is said, in one line, of a file that a tuning cannot be resumed from."""
+    reason = " ".join(reason.split())
+    return f"{file} cannot be used ({reason}): remove it, and the tuning begins anew"
