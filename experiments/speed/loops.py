@@ -1,6 +1,7 @@
 """Sections of the closed loop: many environments, each with its NMPC and its weights."""
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -10,6 +11,8 @@ from agents.weight_tuning.vector_env import WeightTuningVectorEnv
 from experiments.speed import peers
 from experiments.speed.measure import Effort, Section, Tick, calibrated, interleave
 from lpv_track_env.vector_env import PathTrackingVectorEnv
+
+Once = Callable[[], float]
 
 PERIODS = 20
 """Control periods a call: a decision of a weight policy each second, say."""
@@ -27,20 +30,13 @@ def loops(section: Section, effort: Effort, tick: Tick) -> None:
         "its own weights, "
         "started anywhere on its path with some error. Resets stand outside the clock."
     )
-    for n in effort.batches:
-        pairs = []
-        for threads in effort.threads:
-            if threads > n:
-                continue
-            tick(f"closed loops: {n} environments, {threads} threads")
-            series = section.add("closed loop", "s/period", n=n, threads=threads)
-            loop = closed_loop(effort.trajectories, n, threads)
-            run = Driving(loop)
-            once = calibrated(run, effort.round_seconds)
-            pairs.append((series, lambda run=run, once=once: once() / run.periods))
-        interleave(pairs, effort.rounds)
-        for series, _ in pairs[1:]:
-            section.compare(series, pairs[0][0])
+
+    def make(n: int, threads: int) -> Once:
+        run = Driving(closed_loop(effort.trajectories, n, threads))
+        once = calibrated(run, effort.round_seconds)
+        return lambda: once() / run.periods
+
+    _over_threads(section, effort, tick, ("closed loop", "s/period"), make)
 
 
 def tuning(section: Section, effort: Effort, tick: Tick) -> None:
@@ -51,24 +47,39 @@ def tuning(section: Section, effort: Effort, tick: Tick) -> None:
         f"under `randomised`, on {' and '.join(effort.trajectories)}; episodes begin anew in "
         "the clock."
     )
+
+    def make(n: int, threads: int) -> Once:
+        envs = WeightTuningVectorEnv(
+            n, list(effort.trajectories), conditions="randomised", random_start=True,
+            autoreset_mode="SameStep", threads=threads,
+        )  # fmt: skip
+        envs.action_space.seed(0)
+        run = peers.stepping(envs, np.stack([envs.action_space.sample() for _ in range(16)]))
+        once = calibrated(run, effort.round_seconds)
+        return lambda: once() / n
+
+    _over_threads(section, effort, tick, ("WeightTuning-v0", "s/decision"), make)
+
+
+def _over_threads(
+    section: Section,
+    effort: Effort,
+    tick: Tick,
+    series: tuple[str, str],
+    make: Callable[[int, int], Once],
+) -> None:
+    """Rounds of what `make(n, threads)` gives, a series (name, unit) each."""
+    name, unit = series
     for n in effort.batches:
         pairs = []
         for threads in effort.threads:
             if threads > n:
                 continue
-            tick(f"weight tuning: {n} environments, {threads} threads")
-            series = section.add("WeightTuning-v0", "s/decision", n=n, threads=threads)
-            envs = WeightTuningVectorEnv(
-                n, list(effort.trajectories), conditions="randomised", random_start=True,
-                autoreset_mode="SameStep", threads=threads,
-            )  # fmt: skip
-            envs.action_space.seed(0)
-            run = peers.stepping(envs, np.stack([envs.action_space.sample() for _ in range(16)]))
-            once = calibrated(run, effort.round_seconds)
-            pairs.append((series, lambda once=once: once() / n))  # noqa: B023
+            tick(f"{name}: {n} environments, {threads} threads")
+            pairs.append((section.add(name, unit, n=n, threads=threads), make(n, threads)))
         interleave(pairs, effort.rounds)
-        for series, _ in pairs[1:]:
-            section.compare(series, pairs[0][0])
+        for many, _ in pairs[1:]:
+            section.compare(many, pairs[0][0])
 
 
 def closed_loop(trajectories: tuple[str, ...], n: int, threads: int) -> ClosedLoop:
