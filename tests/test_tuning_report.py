@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agents.weights import TrackingWeights, WeightSchedule
-from experiments.tuning.evaluation import FIGURES, EvaluationSet
+from experiments.tuning.evaluation import FIGURES, IN_BANDS, EvaluationSet
 from experiments.tuning.ladder import BASELINE
 from experiments.tuning.loop import PROGRESS, WEIGHTS
 from experiments.tuning.oracle import Headroom
@@ -42,7 +42,10 @@ def fixture_made(tmp_path: Path) -> Study:
         for given in SETS:
             zero = np.zeros((len(given.trajectories), given.seeds))
             score = zero + SCORES[one.label]
-            figures = {**dict.fromkeys(FIGURES, zero), "score": score, "lateral": score}
+            figures = {
+                **dict.fromkeys(FIGURES, zero), **dict.fromkeys(IN_BANDS, np.nan * zero),
+                "score": score, "lateral": score, "in_straight": score,
+            }  # fmt: skip
             write_figures(made.judged(given.name, one.label, seed), figures)
     return made
 
@@ -90,6 +93,9 @@ def test_the_page_says_what_was_judged(made: Study, tmp_path: Path) -> None:
     assert parsed.open == []
     for words in ("+25.0%", "-100.0%", "+50.0%", "0 of 8", "The ladder on held-out", "u-turn"):
         assert words in parsed.text, words
+    # In the one band that there is, as everywhere.
+    assert "+25.0% (+25.0% to +25.0%)" in parsed.text
+    assert page.count("<figure>") == 4
     # A quarter is half of the half that the greedy oracle finds.
     line = next(line for line in summary["ladder"] if line[0] == "bands")
     assert line[8:11] == ["+25.0%", "+25.0% to +25.0%", "50%"]

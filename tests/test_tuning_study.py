@@ -14,6 +14,7 @@ pytest.importorskip("cma")
 from weight_policies import random_weight_policy
 
 import agents
+import trajectories
 from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.files import load
 from agents.weight_tuning.policy import WeightPolicy
@@ -25,7 +26,14 @@ from experiments.options import parser
 from experiments.rollout import rollout
 from experiments.tuning import ladder, study
 from experiments.tuning.command import settings_of
-from experiments.tuning.evaluation import FIGURES, EvaluationSet, Judge, usual_sets
+from experiments.tuning.evaluation import (
+    FIGURES,
+    IN_BANDS,
+    EvaluationSet,
+    Judge,
+    band_scores,
+    usual_sets,
+)
 from experiments.tuning.ladder import BASELINE, CURVATURE, EVERY, LADDER, OURS, Rung, baseline_of
 from experiments.tuning.settings import LEARNED, usual
 from experiments.tuning.study import (
@@ -36,6 +44,8 @@ from experiments.tuning.study import (
     run_trainings,
     write_figures,
 )
+from lpv_track_env import kernels
+from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.observation import ObservationLayout
 from trajectories import CurvatureBands
 
@@ -58,6 +68,39 @@ def judged(result: Any, conditions: str, **more: Any) -> dict[str, Array]:
     assert set(figures) == set(FIGURES)
     assert all(values.shape == (1, 2) for values in figures.values())
     return {name: values[0] for name, values in figures.items()}
+
+
+def test_scores_in_bands_are_those_of_their_periods() -> None:
+    """On a circle all periods are of one band; on a figure of eight squares add up over bands."""
+    given = EvaluationSet("few", ("circle", "figure-eight"), "realtime", 2, env_settings=SETTINGS)
+    figures = Judge(given).judge(SCHEDULE)
+    assert not figures["failed"].any()
+    np.testing.assert_allclose(figures["in_moderate"][0], figures["score"][0], rtol=1e-9)
+    for band in ("straight", "gentle", "sharp"):
+        assert np.isnan(figures[f"in_{band}"][0]).all()
+    eight = np.array([figures[f"in_{band}"][1] for band in CurvatureBands().names])
+    seen = np.isfinite(eight).sum(axis=0)
+    assert (seen >= 2).all()
+    # Root mean squares of the whole lie between those of the parts.
+    assert (np.nanmin(eight, axis=0) < figures["score"][1]).all()
+    assert (np.nanmax(eight, axis=0) > figures["score"][1]).all()
+
+
+def test_a_band_s_score_is_of_its_periods_alone() -> None:
+    """Of made traces: lateral errors of two sizes, each in a band of its own."""
+    path = trajectories.load("figure-eight")
+    places = np.linspace(0.0, path.length, 400, endpoint=False)
+    bands = CurvatureBands().classify(path.sample(places).curvature)
+    trace = np.zeros((1, 401, kernels.MEMORY_SIZE))
+    trace[0, 1:, kernels.ARC_LENGTH] = places
+    trace[0, 1:, kernels.LATERAL_ERROR] = 0.05 * (1.0 + bands)
+    trace[0, 300:] = np.nan
+    found = band_scores(trace, path, PathTrackingEnv(path))
+    for index, name in enumerate(CurvatureBands().names):
+        if (bands[:299] == index).any():
+            assert found[f"in_{name}"][0] == pytest.approx(1.0 + index, rel=1e-12)
+        else:
+            assert np.isnan(found[f"in_{name}"][0])
 
 
 def check_against_case(figures: dict[str, Array], seed: int, case: dict[str, Any]) -> None:
@@ -222,7 +265,9 @@ def test_a_study_is_made_read_and_not_made_again(short: Study) -> None:
         seeds = 1 if label == "default" else 2
         figures = short.read("few, short", label)
         assert {values.shape for values in figures.values()} == {(seeds, 2, 2)}
-        assert all(np.isfinite(values).all() for values in figures.values())
+        # But in bands that a path does not have.
+        finite = [name for name, values in figures.items() if np.isfinite(values).all()]
+        assert set(FIGURES) - set(finite) <= set(IN_BANDS)
         for seed in range(seeds):
             lines = short.progress(label, seed)
             assert bool(lines) == (label != "default")

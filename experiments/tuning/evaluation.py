@@ -13,14 +13,15 @@ import agents
 from agents.nmpc.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.policy import WeightPolicy
-from agents.weight_tuning.score import PARTS, failed, parts_of, scores_of
+from agents.weight_tuning.score import PARTS, SCALES, failed, parts_of, scores_of
 from experiments.suites import HELD_OUT, RAW, RAW_PREVIEW, SIX
 from experiments.tuning.drives import threads
 from experiments.tuning.tuner import Result
 from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import VX, VY
+from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.vector_env import PathTrackingVectorEnv
-from trajectories import ReferencePath
+from trajectories import CurvatureBands, ReferencePath
 
 Array = NDArray[Any]
 
@@ -65,10 +66,16 @@ def usual_sets(seeds: int) -> list[EvaluationSet]:
     ]
 
 
-FIGURES = (*PARTS, "score", "max_cte", "ale", "aoe", "failed", "violated", "clipped", "failures")
+BANDS = CurvatureBands()
+IN_BANDS = tuple(f"in_{name}" for name in BANDS.names)
+FIGURES = (
+    *PARTS, "score", "max_cte", "ale", "aoe", "failed", "violated", "clipped", "failures",
+    *IN_BANDS,
+)  # fmt: skip
 """Of every drive: parts of the score and the score; the largest lateral error (m), its rms (m), the
 heading error's (rad); whether it failed; shares of periods in which |vy| / vx or the steering's or
-jerk's limit was broken, and in which an actuator clipped its command; failed solves."""
+jerk's limit was broken, and in which an actuator clipped its command; failed solves; the score of
+the periods in each band of |curvature| at the foot point alone, NaN where there is none."""
 
 
 class Judge:
@@ -112,7 +119,9 @@ class Judge:
         trace = np.full((envs.num_envs, limit, k.MEMORY_SIZE), np.nan)
         before = envs.memories.copy()
         tally = loop.drive(limit, trace=trace)
-        return figures_of(tally, envs, np.concatenate([before[:, None], trace], axis=1))
+        trace = np.concatenate([before[:, None], trace], axis=1)
+        path = envs.single.task.path
+        return {**figures_of(tally, envs, trace), **band_scores(trace, path, envs.single)}
 
 
 def loop_with(result: Result, envs: PathTrackingVectorEnv, *, by_path: bool = False) -> ClosedLoop:
@@ -153,6 +162,25 @@ def figures_of(tally: Tally, envs: PathTrackingVectorEnv, trace: Array) -> dict[
         "clipped": tally.clipped / steps,
         "failures": tally.failures,
     }
+
+
+def band_scores(trace: Array, path: ReferencePath, env: PathTrackingEnv) -> dict[str, Array]:
+    """Scores of drives by what happened in each band, (n,) each; `trace` as in `figures_of`."""
+    after = trace[:, 1:]
+    rates = np.diff(trace[:, :, [k.STEERING, k.ACCELERATION]], axis=1) / env.control_period
+    errors = after[:, :, [k.LATERAL_ERROR, k.HEADING_ERROR, k.SPEED_ERROR]]
+    squares = (np.concatenate([errors, rates], axis=2) / SCALES) ** 2
+    driven = np.isfinite(after[:, :, 0])
+    place = np.where(driven, after[:, :, k.ARC_LENGTH], 0.0)
+    bands = BANDS.classify(path.sample(place).curvature)
+    found = {}
+    for index, name in enumerate(IN_BANDS):
+        here = driven & (bands == index)
+        count = here.sum(axis=1)
+        sums = np.where(here[:, :, None], squares, 0.0).sum(axis=1)
+        parts = np.sqrt(sums / np.maximum(count, 1)[:, None])
+        found[name] = np.where(count > 0, parts.sum(axis=1), np.nan)
+    return found
 
 
 KEPT = 1e-3

@@ -1,4 +1,4 @@
-"""Pictures of the tuning study: learning curves, regret against solves, weights over curvature."""
+"""Pictures of the tuning study: learning curves, regret, weights and gains by band."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from agents.weight_tuning.files import load
 from agents.weights import TrackingWeights
 from experiments.figures import COLOURS, render
-from experiments.tuning.evaluation import EvaluationSet, loop_with
+from experiments.tuning.evaluation import BANDS, EvaluationSet, loop_with
 from experiments.tuning.loop import WEIGHTS
 from experiments.tuning.study import Study
-from experiments.tuning.study_tables import Judged
+from experiments.tuning.study_tables import Judged, band_gains
 from experiments.tuning.tuner import Result
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import CurvatureBands
@@ -66,6 +66,29 @@ def regret(rows: Sequence[Judged], greedy: float) -> str:
         axes.legend(fontsize=7)
 
     return render(draw, 3.0, "regret")
+
+
+def gains_in_bands(study: Study, labels: Sequence[str], name: str) -> str:
+    """SVG: gains over the best fixed set in each band of curvature, 95 % intervals."""
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        for k, label in enumerate(labels):
+            gains = band_gains(study, name, label)
+            places = [BANDS.names.index(band) + 0.12 * (k - 0.5 * len(labels)) for band in gains]
+            values = np.array([[gain.low, gain.value, gain.high] for gain in gains.values()]) * 100
+            low, value, high = values.T
+            axes.errorbar(
+                places, value, yerr=[value - low, high - value], color=COLOURS[k % len(COLOURS)],
+                marker="o", ms=3, capsize=2, lw=0, elinewidth=1.0, label=label,
+            )  # fmt: skip
+        axes.axhline(0.0, color="0.5", lw=0.8)
+        axes.set_xticks(range(len(BANDS.names)), BANDS.names)
+        axes.set(ylabel="gain over the best fixed set, %")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7)
+
+    return render(draw, 3.0, "bands")
 
 
 def weights_in_use(result: Result, given: EvaluationSet) -> tuple[Array, Array]:

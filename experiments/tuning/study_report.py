@@ -10,6 +10,7 @@ from experiments.report_page import PAGE
 from experiments.results import hardware, revision, versions
 from experiments.tuning import study_figures as figures
 from experiments.tuning import study_tables as tables
+from experiments.tuning.evaluation import BANDS
 from experiments.tuning.ladder import BASELINE, OURS, PPO
 from experiments.tuning.oracle import Headroom
 from experiments.tuning.study import Study
@@ -40,6 +41,17 @@ def write_report(
             "training. “At most” is the 95 % Clopper-Pearson bound on the rate of failures.</p>",
         ),
     ]
+    rivals = [row.rung.label for row in rows if row.rung.label != BASELINE]
+    if BASELINE in study.labels:
+        body.append(
+            _section(
+                f"Gains in each band of curvature on {main}",
+                html_table(
+                    ("rung", *BANDS.names), tables.band_lines(study, main, rivals),
+                    range(1, 1 + len(BANDS.names)),
+                ) + "<p>Over the best fixed set, of the score of the periods in a band.</p>",
+            )
+        )  # fmt: skip
     if alone := tables.curvature_alone(study):
         name = next(one.name for one in study.sets if one.conditions == "simulation")
         lines = tables.ladder_lines([tables.judged(study, name, one) for one in alone], None)
@@ -114,6 +126,10 @@ def _pictures(study: Study, rows: list[tables.Judged], greedy: float | None) -> 
     if some:
         pictures["Weights in use by band of curvature"] = figures.weights_over_curvature(
             study, some, study.sets[0]
+        )
+    if some and BASELINE in study.labels:
+        pictures["Gains by band of curvature"] = figures.gains_in_bands(
+            study, some, study.sets[0].name
         )
     return (
         '<div class="panels">'

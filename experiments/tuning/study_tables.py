@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.weight_tuning.score import COMFORT, PARTS, TRACKING
+from experiments.tuning.evaluation import BANDS, IN_BANDS
 from experiments.tuning.ladder import Rung, baseline_of, rung
 from experiments.tuning.oracle import Headroom
 from experiments.tuning.statistics import (
@@ -137,6 +138,35 @@ def sets_lines(study: Study, labels: Sequence[str]) -> tuple[list[str], Lines]:
             cells.append(f"{score:.3f}" + (f" ({failures} failed)" if failures else ""))
         lines.append(cells)
     return headings, lines
+
+
+def band_gains(study: Study, name: str, label: str) -> dict[str, Interval]:
+    """Gains over the best fixed set on a set's drives, in each band that its paths have."""
+    ours, base = study.read(name, label), study.read(name, baseline_of(rung(label)))
+    gains = {}
+    for entry, band in zip(IN_BANDS, BANDS.names, strict=True):
+        reference = base[entry]
+        given = np.broadcast_to(ours[entry], reference.shape)
+        # Drives differ in how fast they fail, not in where they lead: a path has a band or not.
+        whole = (np.isfinite(given) & np.isfinite(reference)).all(axis=(0, 2))
+        if whole.any():
+            gains[band] = paired_gain(given[:, whole], reference[:, whole])
+    return gains
+
+
+def band_lines(study: Study, name: str, labels: Sequence[str]) -> Lines:
+    """A line a rung: gains in each band."""
+    lines = []
+    for label in labels:
+        gains = band_gains(study, name, label)
+        cells = [
+            f"{gain.value:+.1%} ({gain.low:+.1%} to {gain.high:+.1%})"
+            if (gain := gains.get(band)) is not None
+            else "–"
+            for band in BANDS.names
+        ]
+        lines.append([label, *cells])
+    return lines
 
 
 PAPER_HEADINGS = ("path", "rung", "Max CTE m", "ALE m", "AOE rad", "score", "steering rate rad/s")
