@@ -18,12 +18,13 @@ from agents.delay import DelayCompensated
 from agents.nmpc.closed_loop import ClosedLoop
 from agents.nmpc.closed_loop_kernels import attend
 from agents.weight_tuning import files
-from agents.weight_tuning.agent import TunedNmpc
+from agents.weight_tuning.agent import SHIPPED, TunedNmpc
 from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.features import size
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
+from lpv_track_env import kernels
 from lpv_track_env.conditions import REALTIME
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.observation import ObservationLayout
@@ -363,3 +364,34 @@ def test_make_wraps_nothing_around_it() -> None:
     assert not isinstance(agent, DelayCompensated)
     with pytest.raises(ValueError, match="make the agent for this environment"):
         agent.predict(np.zeros(12, dtype=np.float32))
+
+
+# As shipped ----------------------------------------------------------------------------------
+
+
+def test_shipped_weights_are_what_their_commands_say() -> None:
+    methods = {}
+    for name, file in SHIPPED.items():
+        result = files.load(file)
+        given = result.training if isinstance(result, WeightPolicy) else result.provenance
+        assert given["settings"]["method"] == name
+        assert f"--method {name}" in given["command"]
+        assert not given["revision"]["modified"]
+        methods[name] = type(result)
+    assert methods == {"search": WeightSchedule, "paired": WeightPolicy}
+
+
+@pytest.mark.parametrize("conditions", ["simulation", "realtime", "randomised"])
+def test_the_shipped_policy_adapts_and_drives(conditions: str) -> None:
+    policy = files.load(SHIPPED["paired"])
+    assert isinstance(policy, WeightPolicy)
+    loop = loop_of(4, {"trajectory": "T2", "conditions": conditions}, policy)
+    loop.reset(seed=3)
+    used = []
+    while loop.running.any():
+        loop.drive(8)
+        used.append(loop.memory.nmpc.weights.copy())
+    assert (loop.envs.arrays.ends == kernels.FINISHED).all()
+    # Position is worth less where fixes are bad than where all is known.
+    assert np.ptp(np.log([row[:, 2] for row in used])) > 0.5
+    assert np.mean([row[:, 2] for row in used]) < TrackingWeights().as_array()[2]

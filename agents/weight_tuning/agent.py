@@ -26,8 +26,12 @@ from lpv_track_env.vehicle import VehicleParameters
 
 Weights = WeightPolicy | WeightSchedule | TrackingWeights
 
-SHIPPED = CHECKPOINTS / "lpv-nmpc-tuned.json"
-"""The weights that come with this project."""
+SHIPPED = {
+    "search": CHECKPOINTS / "lpv-nmpc-tuned.json",
+    "paired": CHECKPOINTS / "lpv-nmpc-tuned-paired.json",
+}
+"""Weights that come with this project, by the method of `lpv-track tune` that found them: the best
+fixed set, for whatever is seen, and a policy for the usual observations."""
 
 
 class TunedNmpc:
@@ -43,7 +47,8 @@ class TunedNmpc:
     task
         What is driven.
     weights
-        A policy, a schedule, a set, or the .json of one of the first two; by default as shipped.
+        A policy, a schedule, a set, or the .json of one of the first two; as shipped: "search",
+        the best fixed set, or "paired", a policy.
     delay_compensation
         Whether the NMPC is shown the observation of the time at which its action lands, see
         `agents.delay`; by default where the task has delays. Errors and lags are watched in the
@@ -65,7 +70,7 @@ class TunedNmpc:
         self,
         task: DrivingTask,
         *,
-        weights: str | Path | Weights = SHIPPED,
+        weights: str | Path | Weights = "search",
         delay_compensation: bool | None = None,
         horizon: int | None = None,
         model: VehicleParameters | None = None,
@@ -210,9 +215,10 @@ def _given(weights: str | Path | Weights) -> Weights:
             "weights must be a policy of weights, a schedule, a set, or the .json of one of the "
             f"first two, not {type(weights).__name__}"
         )
-    if not Path(weights).is_file():
+    file = SHIPPED.get(str(weights), Path(weights))
+    if not file.is_file():
         raise ValueError(
             f"weights {weights}: no such file; give weights= the .json of a schedule or of a "
-            "policy of weights"
+            f"policy of weights, or as shipped: {', '.join(SHIPPED)}"
         )
-    return load(weights)
+    return load(file)
