@@ -70,7 +70,8 @@ def add_tuning_options(tune: argparse.ArgumentParser) -> None:
         "--set", nargs="+", default=[], metavar="KEY=VALUE",
         help="hyperparameters: sigma of search and gradient; pairs, learning_rate of gradient; of "
         "catalogue and rl learning_rate, last_learning_rate, rollout, batch, epochs, discount, "
-        "gae_lambda, clip_range, deviation, hidden, segment",
+        "gae_lambda, clip_range, deviation, hidden, segment; of paired deviation, hold, curvature, "
+        "response, least_curvature, half_life, step",
     )  # fmt: skip
 
 
