@@ -93,7 +93,7 @@ def add_study_options(study: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     study.add_argument(
         "--tracks", type=Path, metavar="DIR",
-        help="folder of TUMFTM centre lines (x_m,y_m,...): one more set, scaled to the vehicle",
+        help="folder of TUMFTM centre lines (x_m,y_m,...): one more set",
     )  # fmt: skip
     study.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2)")
     study.add_argument(

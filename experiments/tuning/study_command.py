@@ -59,7 +59,7 @@ def study_of(options: argparse.Namespace) -> Study:
 
 
 def track_set(folder: Path, seeds: int) -> EvaluationSet:
-    """Real circuits, scaled so that the vehicle can turn in their sharpest bend.
+    """Real circuits in their own size: the usual vehicle can steer their sharpest bends.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def track_set(folder: Path, seeds: int) -> EvaluationSet:
     files = sorted(folder.glob("*.csv"))
     if not files:
         raise ValueError(f"{folder} holds no .csv of a centre line")
-    paths = tuple(read_racetrack(file, scale=0.25) for file in files)
+    paths = tuple(read_racetrack(file) for file in files)
     return EvaluationSet("real circuits, randomised", paths, "randomised", max(seeds // 4, 2))
 
 
