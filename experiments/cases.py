@@ -17,7 +17,7 @@ import numpy as np
 import agents
 import lpv_track_env
 import trajectories
-from agents.registry import check_settings, source_file
+from agents.registry import CHECKPOINTS, check_settings, source_file
 from experiments import learning_cost, metrics
 from experiments.computing import ComputingTimes
 from experiments.rollout import Rollout, rollout
@@ -76,7 +76,11 @@ class Case:
             for value in self.agent_settings.values()
             if isinstance(value, str) and value.endswith(".json")
         )
-        named = (Path(self.trajectory), Path(self.vehicle), source_file(self.agent), *settings)
+        # One that names what is shipped for the agent, beside its default.
+        shipped = (CHECKPOINTS / f"{self.agent}-{v}.json" for v in self.agent_settings.values())
+        named = (
+            Path(self.trajectory), Path(self.vehicle), source_file(self.agent), *settings, *shipped,
+        )  # fmt: skip
         files = [
             hashlib.sha256(file.read_bytes()).hexdigest()
             for file in named

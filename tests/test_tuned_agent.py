@@ -24,6 +24,7 @@ from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.features import size
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
+from experiments import cases
 from lpv_track_env import kernels
 from lpv_track_env.conditions import REALTIME
 from lpv_track_env.env import PathTrackingEnv
@@ -395,3 +396,12 @@ def test_the_shipped_policy_adapts_and_drives(conditions: str) -> None:
     # Position is worth less where fixes are bad than where all is known.
     assert np.ptp(np.log([row[:, 2] for row in used])) > 0.5
     assert np.mean([row[:, 2] for row in used]) < TrackingWeights().as_array()[2]
+
+
+def test_shipped_weights_belong_to_a_case(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(cases, "CHECKPOINTS", tmp_path)
+    case = cases.Case(NAME, "T2", agent_settings={"weights": "paired"})
+    without = case.id
+    (tmp_path / SHIPPED["paired"].name).write_text("{}")
+    assert case.id != without
+    assert case.id == cases.Case(NAME, "T2", agent_settings={"weights": "paired"}).id
