@@ -14,6 +14,7 @@ from agents.nmpc.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import PARTS, SCALES, failed, parts_of, scores_of
+from experiments.band_metrics import BANDS
 from experiments.suites import HELD_OUT, RAW, RAW_PREVIEW, SIX
 from experiments.tuning.drives import threads
 from experiments.tuning.tuner import Result
@@ -21,7 +22,7 @@ from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import VX, VY
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.vector_env import PathTrackingVectorEnv
-from trajectories import CurvatureBands, ReferencePath
+from trajectories import ReferencePath
 
 Array = NDArray[Any]
 
@@ -66,7 +67,6 @@ def usual_sets(seeds: int) -> list[EvaluationSet]:
     ]
 
 
-BANDS = CurvatureBands()
 IN_BANDS = tuple(f"in_{name}" for name in BANDS.names)
 FIGURES = (
     *PARTS, "score", "max_cte", "ale", "aoe", "failed", "violated", "clipped", "failures",

@@ -1,6 +1,6 @@
 """Pictures of the tuning study: learning curves, regret, weights and gains by band."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from agents.weight_tuning.files import load
 from agents.weights import TrackingWeights
+from experiments.band_metrics import BANDS
 from experiments.figures import COLOURS, render
-from experiments.tuning.evaluation import BANDS, EvaluationSet, loop_with
+from experiments.tuning.evaluation import EvaluationSet, loop_with
 from experiments.tuning.loop import WEIGHTS
+from experiments.tuning.statistics import Interval
 from experiments.tuning.study import Study
-from experiments.tuning.study_tables import Judged, band_gains
+from experiments.tuning.study_tables import Judged
 from experiments.tuning.tuner import Result
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import CurvatureBands
@@ -23,6 +25,12 @@ Array = NDArray[Any]
 GROUPS = {"speed": (0, 4), "heading": (1, 5), "position": (2, 3, 6, 7)}
 """Indices of Q and S by what they weigh."""
 WINDOWS = 40
+
+
+def _style(k: int) -> tuple[str, str, str]:
+    """Colour, marker and line of the k-th rung: more of them than colours."""
+    again = k // len(COLOURS)
+    return COLOURS[k % len(COLOURS)], "osD^"[again % 4], ("-", "--", ":", "-.")[again % 4]
 
 
 def learning_curves(study: Study, labels: Sequence[str]) -> str:
@@ -37,8 +45,8 @@ def learning_curves(study: Study, labels: Sequence[str]) -> str:
             length = min(len(lines) for lines in runs)
             solves = [line["solves"] for line in runs[0][:length]]
             scores = np.mean([[line["score"] for line in lines[:length]] for lines in runs], axis=0)
-            colour = COLOURS[k % len(COLOURS)]
-            axes.plot(solves, scores, color=colour, label=label, lw=1.0, marker=".", ms=3)
+            colour, _, line = _style(k)
+            axes.plot(solves, scores, color=colour, ls=line, label=label, lw=1.0, marker=".", ms=3)
         axes.set(xlabel="NMPC solves", ylabel="score of what was tried", xscale="log")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.xaxis.set_minor_formatter(NullFormatter())
@@ -54,10 +62,17 @@ def regret(rows: Sequence[Judged], greedy: float) -> str:
     def draw(figure: Any) -> None:
         axes = figure.subplots()
         for k, row in enumerate(rows):
+            colour, marker, line = _style(k)
+            value = row.score.value - greedy
+            if row.solves == 0.0:
+                axes.axhline(value, color=colour, ls=line, lw=1.0, label=row.rung.label)
+                continue
+            # Side by side, where budgets are the same.
             axes.errorbar(
-                max(row.solves, 1e4), row.score.value - greedy,
+                row.solves * 1.08 ** (k - 0.5 * len(rows)), value,
                 yerr=[[row.score.value - row.score.low], [row.score.high - row.score.value]],
-                color=COLOURS[k % len(COLOURS)], marker="o", capsize=3, label=row.rung.label,
+                color=colour, marker=marker, ms=5, lw=0, elinewidth=1.0, capsize=3,
+                label=row.rung.label,
             )  # fmt: skip
         axes.set(xlabel="NMPC solves", ylabel="regret to the greedy oracle", xscale="log")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -68,14 +83,13 @@ def regret(rows: Sequence[Judged], greedy: float) -> str:
     return render(draw, 3.0, "regret")
 
 
-def gains_in_bands(study: Study, labels: Sequence[str], name: str) -> str:
+def gains_in_bands(every: Mapping[str, Mapping[str, Interval]]) -> str:
     """SVG: gains over the best fixed set in each band of curvature, 95 % intervals."""
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
-        for k, label in enumerate(labels):
-            gains = band_gains(study, name, label)
-            places = [BANDS.names.index(band) + 0.12 * (k - 0.5 * len(labels)) for band in gains]
+        for k, (label, gains) in enumerate(every.items()):
+            places = [BANDS.names.index(band) + 0.12 * (k - 0.5 * len(every)) for band in gains]
             values = np.array([[gain.low, gain.value, gain.high] for gain in gains.values()]) * 100
             low, value, high = values.T
             axes.errorbar(

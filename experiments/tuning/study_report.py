@@ -2,17 +2,19 @@
 
 import html
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.band_metrics import BANDS
 from experiments.html_tables import html_table
 from experiments.report_page import PAGE
 from experiments.results import hardware, revision, versions
 from experiments.tuning import study_figures as figures
 from experiments.tuning import study_tables as tables
-from experiments.tuning.evaluation import BANDS
 from experiments.tuning.ladder import BASELINE, OURS, PPO
 from experiments.tuning.oracle import Headroom
+from experiments.tuning.statistics import Interval
 from experiments.tuning.study import Study
 from trajectories.atomic import write_atomically
 
@@ -42,12 +44,14 @@ def write_report(
         ),
     ]
     rivals = [row.rung.label for row in rows if row.rung.label != BASELINE]
+    gains = {}
     if BASELINE in study.labels:
+        gains = {label: tables.band_gains(study, main, label) for label in rivals}
         body.append(
             _section(
                 f"Gains in each band of curvature on {main}",
                 html_table(
-                    ("rung", *BANDS.names), tables.band_lines(study, main, rivals),
+                    ("rung", *BANDS.names), tables.band_lines(gains),
                     range(1, 1 + len(BANDS.names)),
                 ) + "<p>Over the best fixed set, of the score of the periods in a band.</p>",
             )
@@ -77,7 +81,7 @@ def write_report(
                     ),
                 )
             )  # fmt: skip
-    body.append(_section("Pictures", _pictures(study, rows, greedy)))
+    body.append(_section("Pictures", _pictures(study, rows, greedy, gains)))
     manifest = {
         "solves": study.solves, "seeds": list(study.seeds), "rungs": list(study.labels),
         "sets": [
@@ -117,7 +121,12 @@ def _headroom(rows: list[Headroom], greedy: float | None) -> str:
     )
 
 
-def _pictures(study: Study, rows: list[tables.Judged], greedy: float | None) -> str:
+def _pictures(
+    study: Study,
+    rows: list[tables.Judged],
+    greedy: float | None,
+    gains: Mapping[str, Mapping[str, Interval]],
+) -> str:
     labels = [row.rung.label for row in rows if row.rung.method != "fixed"]
     pictures = {"Scores of what was tried": figures.learning_curves(study, labels)}
     if greedy is not None:
@@ -127,10 +136,8 @@ def _pictures(study: Study, rows: list[tables.Judged], greedy: float | None) -> 
         pictures["Weights in use by band of curvature"] = figures.weights_over_curvature(
             study, some, study.sets[0]
         )
-    if some and BASELINE in study.labels:
-        pictures["Gains by band of curvature"] = figures.gains_in_bands(
-            study, some, study.sets[0].name
-        )
+    if shown := {label: gains[label] for label in some if label in gains}:
+        pictures["Gains by band of curvature"] = figures.gains_in_bands(shown)
     return (
         '<div class="panels">'
         + "".join(

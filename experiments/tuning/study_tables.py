@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.weight_tuning.score import COMFORT, PARTS, TRACKING
-from experiments.tuning.evaluation import BANDS, IN_BANDS
+from experiments.band_metrics import BANDS
+from experiments.tuning.evaluation import IN_BANDS
 from experiments.tuning.ladder import Rung, baseline_of, rung
 from experiments.tuning.oracle import Headroom
 from experiments.tuning.statistics import (
@@ -154,11 +155,10 @@ def band_gains(study: Study, name: str, label: str) -> dict[str, Interval]:
     return gains
 
 
-def band_lines(study: Study, name: str, labels: Sequence[str]) -> Lines:
+def band_lines(every: Mapping[str, Mapping[str, Interval]]) -> Lines:
     """A line a rung: gains in each band."""
     lines = []
-    for label in labels:
-        gains = band_gains(study, name, label)
+    for label, gains in every.items():
         cells = [
             f"{gain.value:+.1%} ({gain.low:+.1%} to {gain.high:+.1%})"
             if (gain := gains.get(band)) is not None
