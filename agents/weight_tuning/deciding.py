@@ -1,15 +1,23 @@
 """Compiled: a weight policy at work, one vehicle's period at a time."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.learned.network import CLIP, OUTPUTS, TANH, bend, dense
-from agents.weight_tuning.choice import PackedChoice, WeightChoice, weights_for
-from agents.weight_tuning.features import SCALES, fill_features, size
+from agents.weight_tuning.choice import (
+    PackedChoice,
+    WeightChoice,
+    weights_for,
+    weights_for_all,
+)
+from agents.weight_tuning.features import SCALES, fill_all, fill_features, size
 from agents.weight_tuning.watching import CLOCK, DECIDED, FAILURES, ITERATIONS, REJECTED
 from trajectories.compilation import compiled
+
+if TYPE_CHECKING:
+    from agents.nmpc.loop_memory import LoopMemory
 
 Array = NDArray[Any]
 Layers = tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
@@ -56,6 +64,31 @@ class Decider:
     def window(self) -> int:
         """Control periods between decisions."""
         return self._window
+
+    def observe(self, observations: Array, memory: "LoopMemory") -> NDArray[np.float32]:
+        """Features (n, size) of vehicles, of observations (n, entries) that are taken in."""
+        p = self.packed
+        seen = np.zeros((len(observations), size(len(self.choice.bands))), dtype=np.float32)
+        fill_all(
+            observations, memory.watched, memory.nmpc.weights, p.sets, memory.nmpc.bands, SCALES,
+            p.log_span, seen,
+        )  # fmt: skip
+        return seen
+
+    def choose(self, actions: Array, mask: Array, bands: Array, memory: "LoopMemory") -> Array:
+        """Write what actions (n, entries) mean into the tables, for bands (n,), where `mask` marks.
+
+        Returns of which actions nothing could be made, (n,) bool. A new decision is counted from.
+        """
+        p = self.packed
+        refused = np.zeros(len(actions), dtype=np.bool_)
+        weights_for_all(
+            actions, mask, bands, p.sets, p.matrix, p.log_span, p.catalogue, memory.tables, refused
+        )
+        decided = memory.watched[mask]
+        decided[:, [CLOCK, FAILURES, ITERATIONS]] = 0.0
+        memory.watched[mask] = decided
+        return refused
 
 
 NOBODY: tuple[Any, ...] = (

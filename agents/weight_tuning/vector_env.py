@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 
 import agents
 from agents.nmpc.closed_loop import ClosedLoop, Tally
-from agents.weight_tuning import features
-from agents.weight_tuning.choice import WeightChoice, weights_for_all
+from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.score import FAILED, failed, marginal_parts, parts_of, scores_of
 from agents.weight_tuning.spaces import action_space, checked_choices, observation_space
-from agents.weight_tuning.watching import CLOCK, FAILURES, ITERATIONS
 from lpv_track_env import kernels as k
 from lpv_track_env.conditions import Conditions
 from lpv_track_env.vector_checks import checked_mask, checked_mode
@@ -178,19 +176,11 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
 
     def _choose(self, actions: Array) -> None:
         """Write what actions (n, entries) mean into the tables of running vehicles."""
-        memory, p = self.loop.memory, self._decider.packed
-        running = ~self._ended
-        refused = np.zeros(self.num_envs, dtype=np.bool_)
-        weights_for_all(
-            actions, running, memory.nmpc.bands, p.sets, p.matrix, p.log_span, p.catalogue,
-            memory.tables, refused,
-        )  # fmt: skip
+        memory, running = self.loop.memory, ~self._ended
+        refused = self._decider.choose(actions, running, memory.nmpc.bands, memory)
         self._rejected += refused
         beyond = (np.abs(actions) > 1.0).any(axis=1)
         self._clipped += running & beyond & ~refused
-        decided = memory.watched[running]
-        decided[:, [CLOCK, FAILURES, ITERATIONS]] = 0.0
-        memory.watched[running] = decided
 
     def _add(self, tally: Tally) -> None:
         """Add a window to the episodes' tallies."""
@@ -210,13 +200,7 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
 
     def _observe(self) -> Array:
         """Features of every environment, (n, size) float32."""
-        memory, p = self.loop.memory, self._decider.packed
-        seen = np.zeros((self.num_envs, self.single_observation_space.shape[0]), dtype=np.float32)  # type: ignore[index]
-        features.fill_all(
-            self.drives.arrays.observations, memory.watched, memory.nmpc.weights, p.sets,
-            memory.nmpc.bands, features.SCALES, p.log_span, seen,
-        )  # fmt: skip
-        return seen
+        return self._decider.observe(self.drives.arrays.observations, self.loop.memory)
 
     def _infos(self, mask: Array, tally: Tally | None = None, ended: Array | None = None) -> Infos:
         """Infos of a window for the environments that `mask` (n,) marks, zeros for the others.

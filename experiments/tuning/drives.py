@@ -49,6 +49,23 @@ def weights_at(point: Array, directions: str, span: float) -> Array:
     return np.clip(weights, LOWEST, HIGHEST)
 
 
+def environments(
+    settings: TuningSettings, paths: list[ReferencePath], count: int
+) -> PathTrackingVectorEnv:
+    """Environments of a tuning's drives, each from a random place on."""
+    return PathTrackingVectorEnv(
+        count, paths, vehicle.load(settings.vehicle),
+        conditions=settings.conditions, control_period=settings.control_period,
+        preview_steps=settings.preview_steps, preview_period=settings.preview_period,
+        time_limit=settings.time_limit, random_start=True, autoreset_mode="Disabled",
+    )  # fmt: skip
+
+
+def first_seed(settings: TuningSettings, number: int) -> int:
+    """Seed of the first drive of round `number`; the others count on."""
+    return TRAINING_EPISODES * (1 + settings.seed) + 1_000_000 * number
+
+
 class TuningDrives:
     """Drives of a tuning, `settings.drives` side by side.
 
@@ -61,12 +78,7 @@ class TuningDrives:
     ) -> None:
         self.settings = settings
         self.bands = CurvatureBands()
-        self.envs = PathTrackingVectorEnv(
-            settings.drives if count is None else count, paths, vehicle.load(settings.vehicle),
-            conditions=settings.conditions, control_period=settings.control_period,
-            preview_steps=settings.preview_steps, preview_period=settings.preview_period,
-            time_limit=settings.time_limit, random_start=True, autoreset_mode="Disabled",
-        )  # fmt: skip
+        self.envs = environments(settings, paths, settings.drives if count is None else count)
         agent: Any = agents.make("lpv-nmpc", self.envs.single)
         self.loop = ClosedLoop(self.envs, agent, bands=self.bands, slew=SLEW, threads=threads())
         self.solves = 0
@@ -78,7 +90,7 @@ class TuningDrives:
 
     def seeds(self, number: int) -> list[int]:
         """Seeds of round `number`, of all drives."""
-        first = TRAINING_EPISODES * (1 + self.settings.seed) + 1_000_000 * number
+        first = first_seed(self.settings, number)
         return [first + k for k in range(self.envs.num_envs)]
 
     def scores(self, tables: Array, number: int, seeds: Sequence[int] | None = None) -> Array:

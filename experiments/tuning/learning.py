@@ -19,9 +19,8 @@ from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.vector_env import WeightTuningVectorEnv
 from agents.weight_tuning.views import seen_in
 from experiments.training import checkpoint
-from experiments.training.seeds import TRAINING_EPISODES
 from experiments.tuning.choices import choice_of
-from experiments.tuning.drives import threads
+from experiments.tuning.drives import first_seed, threads
 from experiments.tuning.settings import TuningSettings
 from experiments.tuning.tuner import Tuner
 from lpv_track_env import vehicle
@@ -94,7 +93,7 @@ class PolicyLearning(Tuner):
         random.seed(seed)
         np.random.seed(seed)  # noqa: NPY002  where SB3 draws from
         torch.manual_seed(seed)
-        self.env.seed(TRAINING_EPISODES * (1 + settings.seed) + 1_000_000 * number)
+        self.env.seed(first_seed(settings, number))
         self.model.set_env(self.env, force_reset=True)
         end = min((number + 1) * self.hyper["segment"], settings.solves)
         rewards: list[float] = []

@@ -18,20 +18,15 @@ import numpy as np
 import agents
 from agents.nmpc.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning import features
-from agents.weight_tuning.choice import weights_for_all
 from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import FAILED, SCALES, failed, rms_so_far, scores_of, squares_of
 from agents.weight_tuning.views import seen_in
-from agents.weight_tuning.watching import CLOCK, FAILURES, ITERATIONS
-from experiments.training.seeds import TRAINING_EPISODES
 from experiments.tuning.choices import choice_of
-from experiments.tuning.drives import Array, threads
+from experiments.tuning.drives import Array, environments, first_seed, threads
 from experiments.tuning.quadratic import PairedQuadratic, Prior
 from experiments.tuning.settings import TuningSettings
 from experiments.tuning.tuner import Tuner, unusable
-from lpv_track_env import vehicle
-from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import ReferencePath
 from trajectories.atomic import write_atomically
 
@@ -53,12 +48,7 @@ class PairedLearning(Tuner):
             raise ValueError(f"paired needs an even number of drives, not {settings.drives}")
         hyper = settings.hyperparameters
         self.choice = choice_of(settings)
-        self.envs = PathTrackingVectorEnv(
-            settings.drives, paths, vehicle.load(settings.vehicle), conditions=settings.conditions,
-            control_period=settings.control_period, preview_steps=settings.preview_steps,
-            preview_period=settings.preview_period, time_limit=settings.time_limit,
-            random_start=True, autoreset_mode="Disabled",
-        )  # fmt: skip
+        self.envs = environments(settings, paths, settings.drives)
         agent: Any = agents.make("lpv-nmpc", self.envs.single)
         self._decider = Decider(self.choice, (), settings.control_period)
         self.loop = ClosedLoop(self.envs, agent, decider=self._decider, threads=threads())
@@ -108,7 +98,7 @@ class PairedLearning(Tuner):
 
     def _drive_round(self, random: np.random.Generator) -> Tally:
         """Drive all pairs once and add what they tell; sums over the drives."""
-        first = TRAINING_EPISODES * (1 + self.settings.seed) + 1_000_000 * self._rounds
+        first = first_seed(self.settings, self._rounds)
         self.loop.reset(seed=[first + k for k in range(self.pairs)] * 2)
         self.loop.attend(np.ones(self.settings.drives, dtype=np.bool_))
         sums = np.zeros((len(Tally._fields), self.settings.drives))
@@ -147,27 +137,14 @@ class PairedLearning(Tuner):
 
     def _observe(self) -> Array:
         """Features that are seen, a leading 1, (drives, 1 + features)."""
-        memory, packed = self.loop.memory, self._decider.packed
-        x = np.zeros((self.settings.drives, len(self.seen)), dtype=np.float32)
-        features.fill_all(
-            self.envs.arrays.observations, memory.watched, memory.nmpc.weights, packed.sets,
-            memory.nmpc.bands, features.SCALES, packed.log_span, x,
-        )  # fmt: skip
+        x = self._decider.observe(self.envs.arrays.observations, self.loop.memory)
         return np.concatenate([np.ones((len(x), 1)), x * self.seen], axis=1)
 
     def _choose(self, actions: Array) -> None:
         """Write what actions mean into the tables, for all bands: none ends a window here."""
-        memory, packed = self.loop.memory, self._decider.packed
-        running = self.loop.running
-        refused = np.zeros(len(actions), dtype=np.bool_)
         for band in range(len(self.choice.bands)):
-            weights_for_all(
-                actions, running, np.full(len(actions), band), packed.sets, packed.matrix,
-                packed.log_span, packed.catalogue, memory.tables, refused,
-            )  # fmt: skip
-        decided = memory.watched[running]
-        decided[:, [CLOCK, FAILURES, ITERATIONS]] = 0.0
-        memory.watched[running] = decided
+            bands = np.full(len(actions), band)
+            self._decider.choose(actions, self.loop.running, bands, self.loop.memory)
 
     def _costs(self, stretch: Tally, drive: Tally, running: Array) -> Array:
         """What a stretch adds to the score of its drive, to first order, (drives,).
