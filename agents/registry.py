@@ -177,4 +177,8 @@ def make(
         from agents.delay import DelayCompensated
 
         agent = DelayCompensated(agent, task, task.actuation, settings.get("model"))
+    if env.observation_space.shape != (task.layout.size,):
+        from agents.surroundings import TrackingPart
+
+        agent = TrackingPart(agent, task)
     return agent

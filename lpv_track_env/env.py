@@ -395,8 +395,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         terminated = truncated = False
         if end:
             if end == kernels.NOT_FINITE:
-                entry = "1 (steering angle)" if isfinite(a) else "0 (acceleration)"
-                raise ValueError(f"action entry {entry} is not finite: {action!r}")
+                _check_finite(a, delta, action)
             info["end"] = kernels.END_NAMES[end]
             truncated = end == kernels.TIME_LIMIT
             terminated = not truncated
@@ -477,6 +476,18 @@ def _two_numbers(action: Any) -> tuple[float, float]:
         raise ValueError(
             f"action must be two numbers [acceleration m/s^2, steering angle rad], not {action!r}"
         ) from None
+
+
+def check_action(action: Any) -> None:
+    """Raise the ValueError that `step` raises, if it refuses an action."""
+    a, delta = _two_numbers(action)
+    _check_finite(a, delta, action)
+
+
+def _check_finite(a: float, delta: float, action: Any) -> None:
+    if not (isfinite(a) and isfinite(delta)):
+        entry = "1 (steering angle)" if isfinite(a) else "0 (acceleration)"
+        raise ValueError(f"action entry {entry} is not finite: {action!r}")
 
 
 def _load_vehicle(value: str | Path | VehicleParameters) -> VehicleParameters:

@@ -46,9 +46,12 @@ CONSTANTS = MEMORY + MEMORY_SIZE
 OBSERVATION = CONSTANTS + CONSTANTS_SIZE
 """From here on float32, two numbers to an entry."""
 
-RUNNING, FINISHED, LEFT_CORRIDOR, WRONG_HEADING, NON_FINITE, TIME_LIMIT = range(6)
-END_NAMES = ("running", "finished", "left_corridor", "wrong_heading", "non_finite", "time_limit")
-"""How an episode ends, by code."""
+RUNNING, FINISHED, LEFT_CORRIDOR, WRONG_HEADING, NON_FINITE, TIME_LIMIT, COLLISION = range(7)
+END_NAMES = (
+    "running", "finished", "left_corridor", "wrong_heading", "non_finite", "time_limit",
+    "collision",
+)  # fmt: skip
+"""How an episode ends, by code; the last only where there is other traffic."""
 NOT_FINITE = -1
 """In place of such a code: the command is not finite."""
 

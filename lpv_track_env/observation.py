@@ -24,8 +24,9 @@ rebuilds the reference in the frame of the foot point from the vector alone.
 """
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -130,6 +131,16 @@ class ObservationLayout:
         """Short hash of names, units and sizes: a policy is made for one layout only."""
         parts = [*SCALARS, *PREVIEW_BOUNDS, self.preview_steps, float(self.preview_period)]
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+    def tracking_part(self, observation: Any) -> NDArray[np.float32]:
+        """The tracking observation (..., size) in one that has more beside it.
+
+        `observation` is a dictionary with the entry `tracking`, or a vector that begins with it,
+        alone or in rows.
+        """
+        if isinstance(observation, Mapping):
+            observation = observation["tracking"]
+        return np.asarray(observation)[..., : self.size]
 
     def unpack(self, observation: ArrayLike) -> TrackingObservation:
         """Take a vector (size,) or a batch (n, size) apart.

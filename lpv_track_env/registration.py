@@ -9,6 +9,7 @@ import gymnasium
 
 PATH_TRACKING = "lpv_track_env/PathTracking-v0"
 WEIGHT_TUNING = "lpv_track_env/WeightTuning-v0"
+HIGHWAY_TRACK = "lpv_track_env/HighwayTrack-v0"
 
 
 def register() -> None:
@@ -26,4 +27,10 @@ def register() -> None:
             id=WEIGHT_TUNING,
             entry_point="agents.weight_tuning.env:WeightTuningEnv",
             vector_entry_point="agents.weight_tuning.vector_env:WeightTuningVectorEnv",
+        )
+        gymnasium.register(
+            id=HIGHWAY_TRACK,
+            entry_point="lpv_track_env.highway.env:HighwayTrackEnv",
+            order_enforce=False,
+            disable_env_checker=True,
         )

@@ -86,8 +86,11 @@ class NmpcProblem:
 
     @property
     def substeps(self) -> int:
-        """Runge-Kutta steps a period, for stability from the least permitted speed upwards."""
-        slowest = max(self.vehicle.speed_range[0], 1.0)
+        """Runge-Kutta steps a period, for stability from the least permitted speed upwards.
+
+        The lateral poles are fastest at standstill, which a speed range may hold.
+        """
+        slowest = max(self.vehicle.speed_range[0], 0.0)
         return math.ceil(self.period * fastest_pole(slowest, self.vehicle) / RK4_STABILITY)
 
     @property

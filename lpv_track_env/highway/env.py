@@ -1,0 +1,297 @@
+"""`lpv_track_env/HighwayTrack-v0`: path tracking on highway-env's roads, among its traffic."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from highway_env.road.road import RoadNetwork
+from numpy.typing import NDArray
+
+from lpv_track_env import kernels, plants
+from lpv_track_env.bicycle import VX
+from lpv_track_env.conditions import Conditions
+from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv, check_action
+from lpv_track_env.highway import scenes
+from lpv_track_env.highway.cruise import CruiseControl
+from lpv_track_env.highway.ego import EgoVehicle
+from lpv_track_env.highway.reference import TrafficReference
+from lpv_track_env.naming import choose
+from lpv_track_env.reward import RewardWeights
+from lpv_track_env.task import Task
+from lpv_track_env.vehicle import VehicleParameters
+from lpv_track_env.vehicle import load as load_vehicle
+from trajectories.speed import SpeedLimits
+
+SURROUNDINGS: dict[str, dict[str, Any]] = {
+    "lidar": {"type": "LidarObservation"},
+    "kinematics": {"type": "Kinematics", "see_behind": True},
+}
+"""highway-env's configurations of the observations that have a name here."""
+
+SIMULATION_PERIOD = 1.0 / 15.0
+"""s; highway-env's own: its vehicles are moved in steps that are not longer."""
+
+OPTIONS = tuple(option for option in RESET_OPTIONS if option != "trajectory")
+EXTRA_TIME = 30.0
+
+
+class HighwayTrackEnv(PathTrackingEnv):
+    """A vehicle (dynamic bicycle) follows a lane of highway-env's roads, among its traffic.
+
+    Action, reward, starting errors, conditions, plants and info are those of
+    `lpv_track_env/PathTracking-v0` (`lpv_track_env.env.PathTrackingEnv`); what follows is what
+    differs.
+
+    ## Path
+
+    The route's lane on which highway-env starts the ego vehicle, refitted as one smooth curve
+    (`lpv_track_env.highway.routes`). The reference speed is the path's own jerk-limited profile,
+    lowered by adaptive cruise control to keep a gap to who is ahead
+    (`lpv_track_env.highway.cruise`): an agent sees that in the speeds of its preview. What the
+    cruise control knows of the traffic is one control period old.
+
+    ## Observation space
+
+    `Dict(tracking=Box(8 + 2 K), surroundings=Box(...))`: the observation of path tracking
+    (`lpv_track_env.observation`), and what highway-env observes: by "lidar" (16, 2), distance and
+    speed of the nearest body in each sector of 22.5 degrees, in units of 60 m and 60 m/s; by
+    "kinematics" (5, 5), the rows of nearby vehicles. With `flat=True` both in one `Box`, tracking
+    first; with `surroundings=None` tracking alone. This project's agents take the tracking part.
+
+    ## Episode end
+
+    As in path tracking, a lap (or `laps`) or the end of the route being `finished`, and
+
+    | end | when |
+    |---|---|
+    | `collision` | the body touches another (terminated; the reward's `end` term counts it) |
+
+    ## Starting state
+
+    `reset(seed=s)` makes the very traffic that highway-env makes with seed s, and starts where its
+    ego vehicle would; further resets draw new ones. Options are those of path tracking, without
+    `trajectory`.
+
+    ## Info
+
+    Beside path tracking's: `gap` (m to the bumper of who is ahead, inf if nobody is),
+    `leader_speed` (m/s along the path, nan if nobody is), `lane_error` (m, offset from the centre
+    of highway-env's own lane, positive to the path's left), `collision` (bool).
+
+    ## Arguments
+
+    scene
+        A name (`lpv_track_env.highway.scenes.SCENES`), a `Scene`, or a `RoadNetwork` of the user's.
+    route
+        Names of the nodes to pass, if not the scene's own; a lap ends where it begins.
+    surroundings
+        "lidar", "kinematics", a configuration of highway-env's observations, or None.
+    flat
+        Whether the observation is one vector.
+    other_vehicles
+        Number of other vehicles in the scene's terms (`Scene.make`); None: highway-env's own.
+    cruise
+        Settings of the gap, or None: the path's own speed, whoever is ahead.
+    speed_limits
+        Of the reference, in place of 2 m/s^2 across, 1.5 m/s^2 along and the scene's speed.
+    laps
+        Of a closed route, until the episode is finished.
+
+    vehicle
+        As in `PathTrackingEnv`; the least of its speed range becomes 0, for it may have to stop.
+
+    The others are those of `PathTrackingEnv`; `time_limit` is by default twice the path's duration
+    and 30 s more.
+
+    ## Version history
+
+    v0: first version.
+    """
+
+    def __init__(
+        self,
+        scene: str | scenes.Scene | RoadNetwork = "racetrack",
+        vehicle: str | Path | VehicleParameters = "m2-minibus",
+        conditions: str | Conditions | dict[str, Any] = "simulation",
+        control_period: float = 0.05,
+        render_mode: str | None = None,
+        *,
+        route: Sequence[str] | None = None,
+        surroundings: str | Mapping[str, Any] | None = "lidar",
+        flat: bool = False,
+        other_vehicles: int | None = None,
+        cruise: CruiseControl | None = CruiseControl(),  # noqa: B008  frozen
+        speed_limits: SpeedLimits | None = None,
+        laps: int = 1,
+        preview_steps: int = 20,
+        preview_period: float | None = None,
+        reward_weights: RewardWeights | None = None,
+        max_lateral_error: float = 5.0,
+        time_limit: float | None = None,
+        initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        plant: str | plants.Factory = plants.BICYCLE,
+    ) -> None:
+        self.scene = scenes.load(scene, route)
+        if laps < 1 or (laps > 1 and not self.scene.closed):
+            raise ValueError(
+                f"laps must be at least 1, and 1 on a route that is no lap, not {laps}"
+            )
+        self.laps, self.cruise, self.flat = laps, cruise, flat
+        self.speed_limits = speed_limits or SpeedLimits(
+            max_speed=self.scene.max_speed, max_lateral_acceleration=2.0, max_acceleration=1.5
+        )
+        self._time_limit = time_limit
+        config = _observation_config(surroundings)
+        self.highway = self.scene.make(other_vehicles, config or SURROUNDINGS["lidar"])
+        self._surrounded = config is not None
+        self._ego: EgoVehicle | None = None
+        super().__init__(
+            scenes.path_of(self.scene, 0, self.speed_limits), stoppable(vehicle), "variable", None,
+            conditions, control_period, render_mode,
+            preview_steps=preview_steps, preview_period=preview_period,
+            reward_weights=reward_weights, max_lateral_error=max_lateral_error,
+            time_limit=time_limit, initial_error_range=initial_error_range, plant=plant,
+        )  # fmt: skip
+        self.observation_space = self._space(self.observation_space)
+
+    def _space(self, tracking: spaces.Space[Any]) -> spaces.Space[Any]:
+        """The whole observation's space, from that of its tracking part."""
+        if not self._surrounded:
+            return tracking
+        around = self.highway.observation_type.space()
+        if not self.flat:
+            return spaces.Dict({"tracking": tracking, "surroundings": around})
+        return spaces.flatten_space(spaces.Tuple((tracking, around)))
+
+    def _observation_of(self, tracking: NDArray[np.float32]) -> Any:
+        """The whole observation around its tracking part."""
+        if not self._surrounded:
+            return tracking
+        around = self.highway.observation_type.observe().astype(np.float32)
+        if self.flat:
+            return np.concatenate([tracking, around.ravel()])
+        return {"tracking": tracking, "surroundings": around}
+
+    def episode_task(self, options: Mapping[str, Any]) -> Task:
+        """Task of an episode with reset options `trajectory` and `vehicle`, if given."""
+        task = super().episode_task(options)
+        limit = self._time_limit
+        if limit is None:
+            limit = self.laps * 2.0 * task.path.duration + EXTRA_TIME
+        return replace(task, time_limit=limit, vehicle=stoppable(task.vehicle))
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode; see the class for `options`."""
+        options = dict(options or {})
+        for key in options:
+            choose("reset option", key, OPTIONS)
+        if seed is None:
+            self.highway.reset(seed=int(self.np_random.integers(2**31)))
+        else:
+            self.highway.reset(seed=seed)
+        start = self.highway.vehicle
+        path = scenes.path_of(self.scene, int(start.lane_index[2]), self.speed_limits)
+        options.setdefault("arc_length", path.project(*start.position).arc_length)
+        tracking, info = super().reset(seed=seed, options={**options, "trajectory": path})
+        self._memory[kernels.START] += (self.laps - 1) * path.length
+        self._reference = TrafficReference(path, self.vehicle, self.layout, self.cruise)
+        self._take_table(self._reference.table)
+        self._put_ego(start)
+        self._look_ahead()
+        return self._observation_of(tracking), {**info, **self._info()}
+
+    def _put_ego(self, start: Any) -> None:
+        """Put the plant's vehicle on the road, in place of highway-env's own."""
+        road = self.highway.road
+        for one in road.vehicles:
+            # highway-env's IDM brakes on below standstill, and would drive off backwards.
+            one.MIN_SPEED = 0.0
+        self._ego = EgoVehicle(road, self.vehicle)
+        road.vehicles[road.vehicles.index(start)] = self._ego
+        self.highway.controlled_vehicles = [self._ego]
+        self.highway.define_spaces()
+        self._place()
+
+    def _place(self) -> None:
+        assert self._ego is not None
+        self._ego.place(self._memory[:6], float(self._memory[kernels.REFERENCE_SPEED]))
+
+    @property
+    def others(self) -> list[Any]:
+        """Every other body on the road: highway-env's vehicles and objects."""
+        road = self.highway.road
+        return [one for one in (*road.vehicles, *road.objects) if one is not self._ego]
+
+    def _look_ahead(self) -> None:
+        """Find who is ahead, and lower the reference's speed to keep the gap."""
+        s, speed = float(self._memory[kernels.ARC_LENGTH]), float(self._memory[VX])
+        self._reference.look(s, speed, self.others)
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Drive one control period; see the class for actions, rewards, ends and errors."""
+        if self._running:
+            # What the plant would refuse must not move the traffic.
+            check_action(action)
+            self._move_traffic()
+        tracking, reward, terminated, truncated, info = super().step(action)
+        self._place()
+        if self._collides():
+            if not terminated:
+                loss = -self.task.reward_weights.end
+                info["reward_terms"]["end"] += loss
+                reward += loss
+            info["end"] = kernels.END_NAMES[kernels.COLLISION]
+            self._memory[kernels.END] = kernels.COLLISION
+            terminated, truncated, self._running = True, False, False
+        self._look_ahead()
+        return self._observation_of(tracking), reward, terminated, truncated, info | self._info()
+
+    def _move_traffic(self) -> None:
+        """Everybody else decides and drives a control period, in steps that suit highway-env."""
+        road = self.highway.road
+        steps = math.ceil(self.control_period / SIMULATION_PERIOD - 1e-9)
+        for _ in range(steps):
+            road.act()
+            for one in road.vehicles:
+                one.step(self.control_period / steps)
+
+    def _collides(self) -> bool:
+        """Have highway-env look for collisions; whether the ego vehicle is in one."""
+        assert self._ego is not None
+        road = self.highway.road
+        for k, one in enumerate(road.vehicles):
+            for other in (*road.vehicles[k + 1 :], *road.objects):
+                one.handle_collisions(other, self.control_period)
+        return bool(self._ego.crashed)
+
+    def _info(self) -> dict[str, Any]:
+        assert self._ego is not None
+        lane = self._ego.lane.local_coordinates(self._ego.position)[1]
+        leader = self._reference.leader
+        return {
+            "gap": float(leader.gap), "leader_speed": float(leader.speed),
+            "lane_error": float(lane), "collision": bool(self._ego.crashed),
+        }  # fmt: skip
+
+
+def stoppable(vehicle: str | Path | VehicleParameters) -> VehicleParameters:
+    """Vehicle whose controllers may come to a halt: behind others, a least speed is a collision."""
+    car = load_vehicle(vehicle)
+    return car.replace(speed_range=(0.0, car.speed_range[1]))
+
+
+def _observation_config(surroundings: str | Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """highway-env's configuration of an observation; None for none."""
+    if surroundings is None:
+        return None
+    if isinstance(surroundings, str):
+        return SURROUNDINGS[choose("surroundings", surroundings, tuple(SURROUNDINGS))]
+    return dict(surroundings)
