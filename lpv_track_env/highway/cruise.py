@@ -21,10 +21,13 @@ from numpy.typing import NDArray
 
 from trajectories import ReferencePath
 from trajectories.interpolation import SPEED, TIME
-from trajectories.path import MINIMUM_SPEED
 
 Array = NDArray[np.float64]
 
+STANDSTILL = 1e-3
+"""m/s that stand for a stop: a reference's time would not go on at 0."""
+CRAWL = 0.3
+"""m/s; slower than this a stop is asked for at once, for a path's cells do not resolve it."""
 HELD = 100.0
 """m beyond a profile's end over which its last speed holds."""
 
@@ -116,6 +119,8 @@ class CruiseControl:
             v = after
             places.append(s)
             speeds.append(v)
+        if speeds[0] < CRAWL and speeds[-1] == 0.0:
+            return np.array(places), np.zeros(len(places))
         return np.array(places), np.array(speeds)
 
 
@@ -146,7 +151,7 @@ def lower_speed(path: ReferencePath, table: Array, arc_length: Array, speed: Arr
         nodes = np.arange(max(first, 0), min(last, n - 1) + 1)
     lowered = np.interp(nodes * h, arc_length, speed)
     at = nodes % (n - 1) if path.closed else nodes
-    table[at, SPEED] = np.clip(lowered, MINIMUM_SPEED, path.speed[at])
+    table[at, SPEED] = np.clip(lowered, STANDSTILL, path.speed[at])
     if path.closed:
         table[n - 1, SPEED] = table[0, SPEED]
     table[0, TIME] = 0.0
