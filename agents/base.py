@@ -80,14 +80,12 @@ class DrivingTask:
         TypeError
             If the environment is not one of path tracking.
         """
-        inner: Any = env.unwrapped
+        names = ("layout", "vehicle", "control_period", "path", "actuation")
         try:
-            return cls(
-                inner.layout, inner.vehicle, inner.control_period, inner.path, inner.actuation
-            )
+            return cls(*(env.get_wrapper_attr(name) for name in names))
         except AttributeError as error:
             raise TypeError(
-                f"{type(inner).__name__} is not a path tracking environment: {error}"
+                f"{type(env.unwrapped).__name__} is not a path tracking environment: {error}"
             ) from None
 
 

@@ -65,7 +65,7 @@ class VehicleParameters:
     max_lateral_velocity_ratio
         |vy| <= ratio vx; in a steady turn at low speed a limit on curvature of about ratio / lr.
     length, width
-        Body, m, for drawing only.
+        Body, m: for drawing, and for gaps and collisions in traffic.
 
     Raises
     ------

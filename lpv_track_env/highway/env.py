@@ -233,9 +233,7 @@ class HighwayTrackEnv(PathTrackingEnv):
         s, speed = float(self._memory[kernels.ARC_LENGTH]), float(self._memory[VX])
         self._reference.look(s, speed, self.others)
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Drive one control period; see the class for actions, rewards, ends and errors."""
         if self._running:
             # What the plant would refuse must not move the traffic.

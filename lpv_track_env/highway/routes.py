@@ -62,6 +62,32 @@ def lane_route(network: RoadNetwork, nodes: Sequence[str], lane: int) -> list[La
     return route
 
 
+def road_ahead(network: RoadNetwork, begin: str, end: str) -> tuple[str, ...]:
+    """Nodes of the road that goes on from a first one, until it ends or closes to a lap.
+
+    Raises
+    ------
+    ValueError
+        Where it branches: then a route must be given.
+    """
+    nodes = [begin, end]
+    while nodes[-1] != begin:
+        following = list(network.graph.get(nodes[-1], {}))
+        if not following:
+            break
+        if len(following) > 1:
+            raise ValueError(
+                f"the road branches at {nodes[-1]!r} to {', '.join(following)}: "
+                f"give a route of nodes that begins with {begin!r}, {end!r}"
+            )
+        if following[0] in nodes[1:]:
+            raise ValueError(
+                f"the road leads back to {following[0]!r}, not to where it begins: give a route"
+            )
+        nodes.append(following[0])
+    return tuple(nodes)
+
+
 def centre_points(network: RoadNetwork, route: Sequence[LaneIndex], *, closed: bool) -> Array:
     """Points (n, 2), m, along the centre lines of a route's lanes, thinned at junctions."""
     lanes = [network.get_lane(index) for index in route]

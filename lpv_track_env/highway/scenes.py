@@ -89,7 +89,6 @@ class Scene:
             If the number cannot be set, or is negative.
         """
         config: dict[str, Any] = {**self.config, "observation": dict(observation)}
-        config["action"] = {"type": "ContinuousAction"}
         if other_vehicles is not None:
             if self.traffic is None:
                 raise ValueError(f"scene {self.name!r} has its own number of other vehicles")

@@ -1,0 +1,242 @@
+"""The other way round: agents of path tracking at the wheel of highway-env's own vehicle."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.envs.common.action import ContinuousAction
+from highway_env.vehicle.kinematics import Vehicle
+from numpy.typing import NDArray
+
+from lpv_track_env import kernels
+from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
+from lpv_track_env.conditions import Actuation
+from lpv_track_env.highway.cruise import CruiseControl
+from lpv_track_env.highway.reference import TrafficReference
+from lpv_track_env.highway.routes import centre_points, lane_route, reference_path, road_ahead
+from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.reward import RewardWeights
+from lpv_track_env.task import Task
+from lpv_track_env.vehicle import VehicleParameters
+from trajectories import ReferencePath
+from trajectories.projection import SEARCH_WINDOW
+from trajectories.speed import SpeedLimits
+
+LIMITS = SpeedLimits(max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5)
+
+
+def vehicle_of(env: AbstractEnv) -> VehicleParameters:
+    """highway-env's vehicle in this project's terms, with the bounds of an environment's action.
+
+    Its kinematic bicycle turns by v sin(beta) / (L / 2), tan(beta) = tan(delta) / 2, with L the
+    length of its body: a wheelbase of L, the centre of gravity in the middle. Without slip it has
+    no tyres; the stiffness here gives a neutral vehicle the same turns, with 2 degrees of slip at
+    5 m/s^2. Nothing there limits rates: the steering's is what a driver can do.
+
+    Raises
+    ------
+    ValueError
+        If the environment's action is not continuous, or its vehicle one with dynamics.
+    """
+    action = env.action_type
+    if not (isinstance(action, ContinuousAction) and type(action) is ContinuousAction):
+        raise ValueError(
+            "highway-env's action must be continuous: make the environment with "
+            "config={'action': {'type': 'ContinuousAction'}}"
+        )
+    if action.dynamical or not action.lateral:
+        raise ValueError(
+            "highway-env's vehicle must be its kinematic one and be steered: "
+            "leave 'dynamical' and 'lateral' of its action at their defaults"
+        )
+    low, high = action.acceleration_range
+    half = 0.5 * Vehicle.LENGTH
+    return VehicleParameters(
+        name="highway-env",
+        source="highway_env.vehicle.kinematics.Vehicle",
+        mass=1500.0,
+        yaw_inertia=1500.0 * half**2,
+        front_axle_distance=half,
+        rear_axle_distance=half,
+        front_cornering_stiffness=1.0e5,
+        rear_cornering_stiffness=1.0e5,
+        rolling_resistance=0.0,
+        max_steering_angle=min(action.steering_range[1], math.pi / 6),
+        max_steering_rate=1.0,
+        acceleration_range=(float(low), float(high)),
+        longitudinal_acceleration_range=(float(low), float(high)),
+        max_jerk=20.0,
+        max_lateral_velocity_ratio=0.5,
+        speed_range=(0.0, 30.0),
+        length=Vehicle.LENGTH,
+        width=Vehicle.WIDTH,
+    )
+
+
+class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment of highway-env that takes and gives what this project's agents know.
+
+    Its vehicle, its simulation, its reward and ends are highway-env's own. The observation is that
+    of path tracking (`lpv_track_env.observation`) along the vehicle's route, the action
+    [acceleration m/s^2, steering angle rad]; so `agents.make("lpv-nmpc", env)` drives it::
+
+        env = HighwayTracking(
+            gymnasium.make("racetrack-v1", config={"action": {"type": "ContinuousAction"}})
+        )
+        agent = agents.make("lpv-nmpc", env)
+        observation, info = env.reset(seed=0)
+        action, memory = agent.predict(observation)
+        observation, reward, terminated, truncated, info = env.step(action)
+
+    The control period is one of the environment's policy; a `policy_frequency` of 10 or more gives
+    a controller something to control. Where its action has no throttle, the reference's speed is
+    the one that the vehicle has, and no gap is kept.
+
+    Parameters
+    ----------
+    env
+        highway-env's, with a `ContinuousAction` and its kinematic vehicle.
+    route
+        Names of the nodes to pass, the first two of the road on which the vehicle starts; by
+        default the road goes on to its end, or around a lap.
+    cruise
+        Settings of the gap that is kept, or None.
+    speed_limits
+        Of the reference.
+    preview_steps
+        K, of a control period each.
+
+    Infos have, beside highway-env's, `lateral_error`, `heading_error`, `speed_error`, `arc_length`
+    and `state` as in path tracking, and `gap`.
+
+    Raises
+    ------
+    ValueError
+        If the environment is none of highway-env's, or its action cannot be driven with.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        route: Sequence[str] | None = None,
+        *,
+        cruise: CruiseControl | None = CruiseControl(),  # noqa: B008  frozen
+        speed_limits: SpeedLimits = LIMITS,
+        preview_steps: int = 20,
+    ) -> None:
+        super().__init__(env)
+        inner = env.unwrapped
+        if not isinstance(inner, AbstractEnv):
+            raise ValueError(f"{type(inner).__name__} is not an environment of highway-env")  # noqa: TRY004
+        self.highway, self.vehicle = inner, vehicle_of(inner)
+        self.control_period = 1.0 / inner.config["policy_frequency"]
+        self.layout = ObservationLayout(preview_steps, self.control_period)
+        self.actuation = Actuation()
+        self.route = None if route is None else tuple(route)
+        self._throttle = bool(inner.action_type.longitudinal)
+        self._cruise = cruise if self._throttle else None
+        self._limits = speed_limits
+        self._paths: dict[bytes, ReferencePath] = {}
+        bound = self.layout.bound
+        self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
+        low, high = self.vehicle.acceleration_range
+        steering = self.vehicle.max_steering_angle
+        self.action_space = spaces.Box(
+            np.array([low, -steering], np.float32), np.array([high, steering], np.float32)
+        )
+        self._begin()
+
+    @property
+    def path(self) -> ReferencePath:
+        """The reference path of the current episode."""
+        return self._reference.path
+
+    def _begin(self) -> None:
+        """Lay the reference from where the vehicle starts."""
+        network, start = self.highway.road.network, self.highway.vehicle
+        begin, end, lane = start.lane_index
+        nodes = road_ahead(network, begin, end) if self.route is None else self.route
+        if nodes[:2] != (begin, end):
+            raise ValueError(f"the vehicle starts from {begin!r} to {end!r}: begin the route there")
+        closed = nodes[0] == nodes[-1]
+        route = lane_route(network, nodes, int(lane))
+        key = centre_points(network, route, closed=closed).tobytes()
+        if key not in self._paths:
+            name = f"{type(self.highway).__name__}-{lane}"
+            self._paths[key] = reference_path(
+                network, route, self._limits, closed=closed, name=name
+            )
+        path = self._paths[key]
+        if not self._throttle:
+            path = path.with_speed(max(float(start.speed), 1.0))
+        self._reference = TrafficReference(path, self.vehicle, self.layout, self._cruise)
+        task = Task(path, self.vehicle, self.control_period, self.layout, RewardWeights(),
+                    max_lateral_error=1e6, time_limit=None)  # fmt: skip
+        self._constants = task.constants()
+        self._memory = np.zeros(kernels.MEMORY_SIZE)
+        self._memory[kernels.ARC_LENGTH] = path.project(*start.position).arc_length
+        self._observation = np.zeros(self.layout.size, dtype=np.float32)
+
+    def _observe(self, ahead: float) -> NDArray[np.float32]:
+        """Observe the vehicle, its foot point about `ahead` m from the last."""
+        car, memory = self.highway.vehicle, self._memory
+        steering = float(car.action["steering"])
+        slip = math.atan(0.5 * math.tan(steering))
+        memory[VX], memory[VY] = car.speed * math.cos(slip), car.speed * math.sin(slip)
+        memory[PSI], memory[YAW_RATE] = car.heading, car.speed * math.sin(slip) / (0.5 * car.LENGTH)
+        memory[X], memory[Y] = car.position
+        memory[kernels.ACCELERATION] = float(car.action["acceleration"])
+        memory[kernels.STEERING] = steering
+        window = min(max(SEARCH_WINDOW, 1.5 * abs(ahead)), self.path.length)
+        kernels.look(
+            memory, self._constants, self._reference.table, self._observation, ahead, window
+        )
+        return self._observation.copy()
+
+    def _look_ahead(self) -> None:
+        road, car = self.highway.road, self.highway.vehicle
+        others = [one for one in (*road.vehicles, *road.objects) if one is not car]
+        self._reference.look(float(self._memory[kernels.ARC_LENGTH]), float(car.speed), others)
+
+    def _info(self) -> dict[str, Any]:
+        m = self._memory
+        return {
+            "lateral_error": float(m[kernels.LATERAL_ERROR]),
+            "heading_error": float(m[kernels.HEADING_ERROR]),
+            "speed_error": float(m[kernels.SPEED_ERROR]),
+            "arc_length": float(m[kernels.ARC_LENGTH]),
+            "state": m[:6].copy(),
+            "gap": float(self._reference.leader.gap),
+        }
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode of highway-env."""
+        _, info = self.env.reset(seed=seed, options=options)
+        self._begin()
+        observation = self._observe(0.0)
+        self._look_ahead()
+        return observation, {**info, **self._info()}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
+        """Drive one period of highway-env's policy under [acceleration, steering angle]."""
+        kind = self.highway.action_type
+        scaled = [
+            float(np.interp(value, bounds, (-1.0, 1.0)))
+            for value, bounds in zip(
+                action, (kind.acceleration_range, kind.steering_range), strict=True
+            )
+        ]
+        given = np.array(scaled if self._throttle else scaled[1:], dtype=np.float32)
+        ahead = float(self.highway.vehicle.speed) * self.control_period
+        _, reward, terminated, truncated, info = self.env.step(given)
+        observation = self._observe(ahead)
+        self._look_ahead()
+        return observation, reward, bool(terminated), bool(truncated), {**info, **self._info()}
