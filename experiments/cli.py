@@ -150,6 +150,16 @@ def _switching(options: argparse.Namespace, console: Any) -> int:
         return EXIT_INTERRUPTED
 
 
+def _highway(options: argparse.Namespace, console: Any) -> int:
+    from experiments.highway.command import run_highway
+
+    try:
+        return run_highway(options, console)
+    except KeyboardInterrupt:
+        console.print(f"interrupted: the same command goes on from {options.out}")
+        return EXIT_INTERRUPTED
+
+
 def conditions_of(options: argparse.Namespace) -> str | dict[str, Any]:
     """Conditions by name, or a dictionary of what departs from them."""
     from experiments.benchmark import parse_settings
@@ -249,6 +259,7 @@ RUNNERS: dict[str, Callable[[argparse.Namespace, Any], int]] = {
     "ablation": _realtime,
     "latency": _realtime,
     "switching": _switching,
+    "highway": _highway,
     "verify": _verify,
     "bag": _bag,
     "run-parallel": _run_parallel,

@@ -189,6 +189,43 @@ def _switching(add: Add) -> None:
     switching.add_argument("--out", type=Path, default=Path("results/switching"), metavar="DIR")
 
 
+def _highway(add: Add) -> None:
+    highway = add(
+        "highway",
+        "Drive laps among highway-env's traffic, beside its own controllers.",
+        "lpv-track highway --scene racetrack --agents lpv-nmpc ppo idm --seeds 20",
+    )
+    highway.add_argument(
+        "--scene", default="racetrack", metavar="NAME",
+        help="racetrack (default), racetrack-large, racetrack-oval, roundabout, "
+        "roundabout-generic",
+    )  # fmt: skip
+    highway.add_argument(
+        "--agents", nargs="+", default=["lpv-nmpc", "ppo", "stanley", "idm", "idm-mobil"],
+        metavar="NAME",
+        help="names of agents, files of policies; idm and idm-mobil are highway-env's own "
+        "(default: lpv-nmpc ppo stanley idm idm-mobil)",
+    )  # fmt: skip
+    highway.add_argument("--seeds", type=int, default=20, metavar="N", help="default 20")
+    highway.add_argument(
+        "--other-vehicles", type=int, metavar="N",
+        help="in the scene's terms: racetracks draw 1 to N (default: highway-env's own, 1)",
+    )  # fmt: skip
+    highway.add_argument("--laps", type=int, default=1, metavar="N", help="default 1")
+    highway.add_argument("--conditions", default="simulation", metavar="NAME")
+    highway.add_argument("--control-period", type=float, default=0.05, metavar="S")
+    highway.add_argument(
+        "--env", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the environment"
+    )
+    highway.add_argument(
+        "--agent-set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the agents"
+    )
+    highway.add_argument("--out", type=Path, default=Path("results/highway"), metavar="DIR")
+    highway.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores"
+    )
+
+
 def _verify(add: Add) -> None:
     verify = add(
         "verify",
@@ -310,6 +347,7 @@ def parser() -> argparse.ArgumentParser:
         _ablation,
         _latency,
         _switching,
+        _highway,
         _verify,
         _bag,
         _run_parallel,

@@ -1,6 +1,5 @@
 """`lpv_track_env/HighwayTrack-v0`: path tracking on highway-env's roads, among its traffic."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -31,9 +30,6 @@ SURROUNDINGS: dict[str, dict[str, Any]] = {
     "kinematics": {"type": "Kinematics", "see_behind": True},
 }
 """highway-env's configurations of the observations that have a name here."""
-
-SIMULATION_PERIOD = 1.0 / 15.0
-"""s; highway-env's own: its vehicles are moved in steps that are not longer."""
 
 OPTIONS = tuple(option for option in RESET_OPTIONS if option != "trajectory")
 EXTRA_TIME = 30.0
@@ -191,11 +187,8 @@ class HighwayTrackEnv(PathTrackingEnv):
         options = dict(options or {})
         for key in options:
             choose("reset option", key, OPTIONS)
-        if seed is None:
-            self.highway.reset(seed=int(self.np_random.integers(2**31)))
-        else:
-            self.highway.reset(seed=seed)
-        start = self.highway.vehicle
+        drawn = int(self.np_random.integers(2**31)) if seed is None else seed
+        start = scenes.populate(self.highway, drawn)
         path = scenes.path_of(self.scene, int(start.lane_index[2]), self.speed_limits)
         options.setdefault("arc_length", path.project(*start.position).arc_length)
         tracking, info = super().reset(seed=seed, options={**options, "trajectory": path})
@@ -209,9 +202,6 @@ class HighwayTrackEnv(PathTrackingEnv):
     def _put_ego(self, start: Any) -> None:
         """Put the plant's vehicle on the road, in place of highway-env's own."""
         road = self.highway.road
-        for one in road.vehicles:
-            # highway-env's IDM brakes on below standstill, and would drive off backwards.
-            one.MIN_SPEED = 0.0
         self._ego = EgoVehicle(road, self.vehicle)
         road.vehicles[road.vehicles.index(start)] = self._ego
         self.highway.controlled_vehicles = [self._ego]
@@ -238,10 +228,12 @@ class HighwayTrackEnv(PathTrackingEnv):
         if self._running:
             # What the plant would refuse must not move the traffic.
             check_action(action)
-            self._move_traffic()
+            scenes.move(self.highway.road, self.control_period)
         tracking, reward, terminated, truncated, info = super().step(action)
         self._place()
-        if self._collides():
+        scenes.collide(self.highway.road, self.control_period)
+        assert self._ego is not None
+        if self._ego.crashed:
             if not terminated:
                 loss = -self.task.reward_weights.end
                 info["reward_terms"]["end"] += loss
@@ -251,24 +243,6 @@ class HighwayTrackEnv(PathTrackingEnv):
             terminated, truncated, self._running = True, False, False
         self._look_ahead()
         return self._observation_of(tracking), reward, terminated, truncated, info | self._info()
-
-    def _move_traffic(self) -> None:
-        """Everybody else decides and drives a control period, in steps that suit highway-env."""
-        road = self.highway.road
-        steps = math.ceil(self.control_period / SIMULATION_PERIOD - 1e-9)
-        for _ in range(steps):
-            road.act()
-            for one in road.vehicles:
-                one.step(self.control_period / steps)
-
-    def _collides(self) -> bool:
-        """Have highway-env look for collisions; whether the ego vehicle is in one."""
-        assert self._ego is not None
-        road = self.highway.road
-        for k, one in enumerate(road.vehicles):
-            for other in (*road.vehicles[k + 1 :], *road.objects):
-                one.handle_collisions(other, self.control_period)
-        return bool(self._ego.crashed)
 
     def _info(self) -> dict[str, Any]:
         assert self._ego is not None

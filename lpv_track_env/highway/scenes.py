@@ -15,6 +15,7 @@ those in which vehicles see each other across the ends of their lanes (`-v1`: wi
 into each other there).
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -33,6 +34,8 @@ from lpv_track_env.naming import choose
 from trajectories import ReferencePath
 from trajectories.speed import SpeedLimits
 
+SIMULATION_PERIOD = 1.0 / 15.0
+"""s; highway-env's own: its vehicles are moved in steps that are not longer."""
 CIRCUIT = ("a", "b", "c", "d", "e", "f", "g", "h", "i", "a")
 OVAL = ("a", "b", "c", "d", "e", "f", "g", "h", "a")
 THROUGH = ("ser", "ses", "se", "ex", "ee", "nx", "nxs", "nxr")
@@ -132,6 +135,34 @@ def load(scene: "str | Scene | RoadNetwork", route: Sequence[str] | None = None)
     if route is None:
         return scene
     return replace(scene, route=tuple(route))
+
+
+def populate(highway: AbstractEnv, seed: int) -> Vehicle:
+    """Make the road and traffic of a seed, and return the ego vehicle as highway-env has it.
+
+    One thing is not left as it is: IDM brakes on below standstill, and highway-env's vehicles then
+    drive off backwards; here they stop.
+    """
+    highway.reset(seed=seed)
+    for one in highway.road.vehicles:
+        one.MIN_SPEED = 0.0
+    return highway.vehicle
+
+
+def move(road: Road, period: float) -> None:
+    """Have every vehicle decide and drive for a control period (s), in steps as highway-env's."""
+    steps = math.ceil(period / SIMULATION_PERIOD - 1e-9)
+    for _ in range(steps):
+        road.act()
+        for one in road.vehicles:
+            one.step(period / steps)
+
+
+def collide(road: Road, period: float) -> None:
+    """Have highway-env look for collisions: who touches another is `crashed` from then on."""
+    for k, one in enumerate(road.vehicles):
+        for other in (*road.vehicles[k + 1 :], *road.objects):
+            one.handle_collisions(other, period)
 
 
 @lru_cache(maxsize=64)
