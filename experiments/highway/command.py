@@ -87,7 +87,8 @@ def table(names: Iterable[str], results: Sequence[Result]) -> Table:
     shown = Table(title="In highway-env's traffic", title_justify="left")
     shown.add_column("agent")
     for heading in (
-        "finished", "collisions (95 %)", "other ends", "rms to path m", "worst rms m", "rms to lane m",
+        "finished", "collisions (95 %)", "other ends", "rms to path m", "worst rms m",
+        "rms to lane m",
         "least gap m", "speed m/s", "predict ms",
     ):  # fmt: skip
         shown.add_column(heading, justify="right")
