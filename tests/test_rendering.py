@@ -13,10 +13,11 @@ import pygame
 import pytest
 from numpy.typing import NDArray
 
-from lpv_track_env import kernels, rendering
+from lpv_track_env import kernels
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.registration import PATH_TRACKING
-from lpv_track_env.rendering import HEIGHT, WIDTH, Renderer
+from lpv_track_env.rendering import HEIGHT, WIDTH, Renderer, Scenery, style
+from lpv_track_env.rendering import renderer as rendering
 
 Frame = NDArray[np.uint8]
 ACTION = np.array([0.8, 0.03], dtype=np.float32)
@@ -297,3 +298,65 @@ def test_trail_holds_the_steps_between_frames() -> None:
         frames.append(frame)
         env.close()
     np.testing.assert_array_equal(frames[0], frames[1])
+
+
+# Roads and other vehicles ----------------------------------------------------------------------
+
+SQUARE = np.array([(-8.0, 6.0), (8.0, 6.0), (8.0, 14.0), (-8.0, 14.0)])
+
+
+def drawn(scenery: Scenery | None = None, others: NDArray[np.float64] | None = None) -> Frame:
+    """The start of the straight path, which leads east from the origin."""
+    env = make(trajectory="straight")
+    env.reset(seed=0)
+    renderer = Renderer("rgb_array", 20)
+    renderer.begin(env.task, scenery)
+    renderer.others = others
+    frame = renderer.draw(env._memory)
+    assert frame is not None
+    return frame
+
+
+def count(frame: Frame, colour: tuple[int, int, int]) -> int:
+    return int((frame == colour).all(axis=2).sum())
+
+
+def test_scenery_takes_the_corridors_place() -> None:
+    bare, road = drawn(Scenery([], [])), drawn(Scenery([SQUARE], []))
+    assert count(bare, style.ROAD) == 0
+    wide = count(road, style.ROAD)
+    assert wide > 1000
+    line = np.array([(-8.0, 10.0), (8.0, 10.0)])
+    solid, dashed = (count(drawn(Scenery([SQUARE], [(line, d)])), style.ROAD) for d in (0, 1))
+    assert solid < dashed < wide
+
+
+def test_scenery_out_of_sight_changes_nothing_and_much_of_it_is_left_out() -> None:
+    bare = drawn(Scenery([], []))
+    far = Scenery([SQUARE + 500.0], [(SQUARE + 500.0, False), (SQUARE - 500.0, True)])
+    np.testing.assert_array_equal(drawn(far), bare)
+    # Lines that pass through the picture from far away are cut, not dropped.
+    through = np.column_stack([np.linspace(-2000.0, 2000.0, 400), np.full(400, 9.0)])
+    assert (drawn(Scenery([], [(through, False)])) != bare).any()
+
+
+def test_scenery_that_cannot_be_drawn_is_one_line() -> None:
+    for bad in (SQUARE[:2], np.zeros((4, 3)), np.full((4, 2), np.nan)):
+        with pytest.raises(ValueError, match="a surface must be"):
+            drawn(Scenery([bad], []))
+    with pytest.raises(ValueError, match="a line must be"):
+        drawn(Scenery([], [(SQUARE[:1], False)]))
+
+
+def test_other_vehicles_are_drawn_while_set() -> None:
+    alone = drawn()
+    near = np.array([[6.0, 4.0, 0.3, 4.6, 1.9]])
+    assert count(drawn(others=near), style.OTHER) > 300
+    far, broken = near + 1000.0, near * np.nan
+    for unseen in (far, broken, np.empty((0, 5))):
+        np.testing.assert_array_equal(drawn(others=unseen), alone)
+    # Turned by a quarter it is as large, elsewhere.
+    turned = drawn(others=np.array([[6.0, 4.0, 0.3 + np.pi / 2, 4.6, 1.9]]))
+    assert abs(count(turned, style.OTHER) - count(drawn(others=near), style.OTHER)) < 200
+    with pytest.raises(ValueError, match=r"others must be \(m, 5\)"):
+        drawn(others=np.zeros((2, 4)))

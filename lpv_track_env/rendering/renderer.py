@@ -13,13 +13,15 @@ import math
 import os
 import warnings
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels
 from lpv_track_env.bicycle import PSI, VX, X, Y
+from lpv_track_env.rendering.scenery import Scenery, SceneryDrawing
+from lpv_track_env.rendering.vehicles import draw_others
+from lpv_track_env.rendering.view import View
 from lpv_track_env.task import Task
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
@@ -54,20 +56,6 @@ MAP_SIZE = (190, 150)
 WHEEL_LENGTH, WHEEL_WIDTH = 0.7, 0.26  # m
 
 
-class _View(NamedTuple):
-    """World (m, y upwards) to pixels (y downwards), the camera's centre in the middle."""
-
-    centre: tuple[float, float]
-    scale: float
-    size: tuple[int, int]
-
-    def pixels(self, points: Array) -> Array:
-        """Pixels (n, 2) of world points (n, 2)."""
-        offset = (points - np.array(self.centre)) * np.array([self.scale, -self.scale])
-        moved: Array = offset + 0.5 * np.array(self.size)
-        return moved
-
-
 class Renderer:
     """Draws the memories of one environment's episodes.
 
@@ -82,12 +70,16 @@ class Renderer:
     ----------
     plan
         An agent's predicted positions, (n, 2) m in the world, drawn while set; None for none.
+    others
+        Other vehicles, (m, 5) [X m, Y m, heading rad, length m, width m], drawn while set; None for
+        none.
     """
 
     def __init__(self, render_mode: str, fps: int) -> None:
         self.render_mode = render_mode
         self.fps = fps
         self.plan: NDArray[np.float64] | None = None
+        self.others: NDArray[np.float64] | None = None
         self._window: pygame.Surface | None = None
         self._clock: pygame.time.Clock | None = None
         self._dismissed = False
@@ -99,10 +91,25 @@ class Renderer:
         self._scene = pygame.Surface(size, depth=32)
         self._frame = pygame.Surface((WIDTH, HEIGHT), depth=32)
 
-    def begin(self, task: Task) -> None:
-        """Begin an episode: prepare what the task fixes, forget the trail and the plan."""
+    def begin(self, task: Task, scenery: Scenery | None = None) -> None:
+        """Begin an episode: prepare what is fixed in it, forget trail, plan and other vehicles.
+
+        Parameters
+        ----------
+        task
+            What is driven.
+        scenery
+            Roads to draw in place of the corridor.
+
+        Raises
+        ------
+        ValueError
+            For a scenery that cannot be drawn.
+        """
+        self._scenery = None if scenery is None else SceneryDrawing(scenery)
         self._task = task
         self.plan = None
+        self.others = None
         self._trail: list[tuple[float, float]] = []
         path = task.path
         # Every second node, the end kept: half a metre is 7 pixels.
@@ -180,9 +187,13 @@ class Renderer:
         x, y = float(memory[X]), float(memory[Y])
         self.follow(memory)
         scale = SUPERSAMPLING * WIDTH / VIEW_WIDTH
-        view = _View((x, y), scale, self._scene.get_size())
+        view = View((x, y), scale, (0.5 * self._scene.get_width(), 0.5 * self._scene.get_height()))
         self._scene.fill(BACKGROUND)
+        if self._scenery is not None:
+            self._scenery.draw(self._scene, view, SUPERSAMPLING)
         self._draw_path(view)
+        if self.others is not None:
+            draw_others(self._scene, view, self.others)
         trail = np.array([*self._trail, (x, y)])
         near = np.abs(trail - (x, y)).max(axis=1) < VIEW_WIDTH
         # A trail may leave the view and return: each stay is its own line.
@@ -197,19 +208,19 @@ class Renderer:
         self._draw_map(x, y)
         self._draw_text(memory)
 
-    def _draw_path(self, view: _View) -> None:
+    def _draw_path(self, view: View) -> None:
         reach = 0.5 * math.hypot(VIEW_WIDTH, VIEW_WIDTH * HEIGHT / WIDTH) + self._reach + 2.0
         near = np.hypot(*(self._line - np.array(view.centre)).T) < reach
         cells = np.flatnonzero(near[1:] & near[:-1])
         left, right = view.pixels(self._left), view.pixels(self._right)
-        for k in cells:
+        for k in cells if self._scenery is None else ():
             quad = (left[k], left[k + 1], right[k + 1], right[k])
             pygame.draw.polygon(self._scene, CORRIDOR, quad)
         centre, width = view.pixels(self._line), 3 * SUPERSAMPLING
         for k in cells:
             _stroke(self._scene, self._colours[k], centre[k], centre[k + 1], width)
 
-    def _draw_vehicle(self, view: _View, memory: Array) -> None:
+    def _draw_vehicle(self, view: View, memory: Array) -> None:
         car = self._task.vehicle
         x, y, psi = float(memory[X]), float(memory[Y]), float(memory[PSI])
         steering = float(memory[kernels.STEERING])
@@ -230,7 +241,7 @@ class Renderer:
         centre = shape(np.zeros((1, 2)))[0]
         pygame.draw.circle(self._scene, INK, centre, 2 * SUPERSAMPLING)
 
-    def _draw_plan(self, view: _View) -> None:
+    def _draw_plan(self, view: View) -> None:
         if self.plan is None:
             return
         plan = np.asarray(self.plan, dtype=np.float64).reshape(-1, 2)
@@ -295,13 +306,15 @@ class Renderer:
             self._texts[key] = font.render(text, True, colour)
         return self._texts[key]
 
-    def _overview(self, path: ReferencePath) -> tuple[pygame.Surface, _View]:
+    def _overview(self, path: ReferencePath) -> tuple[pygame.Surface, View]:
         """Map of the whole path, north up, and its view."""
         low, high = self._line.min(axis=0), self._line.max(axis=0)
         room = np.array(MAP_SIZE) - 2.0 * PADDING
         scale = float((room / np.maximum(high - low, 1.0)).min())
         centre = 0.5 * (low + high)
-        view = _View((float(centre[0]), float(centre[1])), scale, MAP_SIZE)
+        view = View(
+            (float(centre[0]), float(centre[1])), scale, (0.5 * MAP_SIZE[0], 0.5 * MAP_SIZE[1])
+        )
         big = (MAP_SIZE[0] * SUPERSAMPLING, MAP_SIZE[1] * SUPERSAMPLING)
         surface = pygame.Surface(big, pygame.SRCALPHA, 32)
         surface.fill(PANEL)
