@@ -8,7 +8,7 @@ import pygame
 from numpy.typing import ArrayLike, NDArray
 
 from lpv_track_env.rendering.style import LANE_LINE, ROAD
-from lpv_track_env.rendering.view import View, boxes, polyline
+from lpv_track_env.rendering.view import View, boxes, clipped, polyline
 
 Array = NDArray[np.float64]
 
@@ -16,6 +16,8 @@ LINE_WIDTH = 0.15
 """m, of a painted line."""
 DASH, GAP = 3.0, 4.5
 """m, of a dashed line."""
+BEYOND = 5.0
+"""m beyond what is seen at which surfaces are cut."""
 PIECE = 16
 """Segments of a solid line that are looked at together: what is out of sight is not drawn."""
 
@@ -55,8 +57,12 @@ class SceneryDrawing:
 
     def draw(self, surface: pygame.Surface, view: View, thinnest: float) -> None:
         """Draw what `view` sees; lines are at least `thinnest` pixels wide."""
+        low, high = view.window()
         for k in view.sees(*self._surface_boxes):
-            pygame.draw.polygon(surface, ROAD, view.pixels(self._surfaces[k]).tolist())
+            # Filling a polygon takes time for all of its height, seen or not.
+            seen = clipped(self._surfaces[k], low - BEYOND, high + BEYOND)
+            if len(seen) > 2:
+                pygame.draw.polygon(surface, ROAD, view.pixels(seen).tolist())
         width = max(LINE_WIDTH * view.scale, thinnest)
         for k in view.sees(*self._piece_boxes):
             polyline(surface, LANE_LINE, view.pixels(self._pieces[k]), width)

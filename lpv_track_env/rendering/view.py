@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import pygame
@@ -15,7 +14,7 @@ CHUNK = 8
 """Segments of a line of one colour that are filled as one polygon."""
 
 
-class View(NamedTuple):
+class View:
     """World (m, y upwards) to pixels (y downwards).
 
     Parameters
@@ -25,24 +24,25 @@ class View(NamedTuple):
     scale
         Pixels a metre.
     middle
-        Pixel (x, y) of the middle.
+        Pixel (x, y) of the middle: that of the picture, or right of it and below.
     """
 
-    centre: tuple[float, float]
-    scale: float
-    middle: tuple[float, float]
+    def __init__(
+        self, centre: tuple[float, float], scale: float, middle: tuple[float, float]
+    ) -> None:
+        self.scale = scale
+        self._centre, self._middle = np.array(centre), np.array(middle)
+        self._stretch = np.array([scale, -scale])
 
     def pixels(self, points: Array) -> Array:
         """Pixels (..., 2) of world points (..., 2) m."""
-        offset = (points - np.array(self.centre)) * np.array([self.scale, -self.scale])
-        moved: Array = offset + np.array(self.middle)
+        moved: Array = (points - self._centre) * self._stretch + self._middle
         return moved
 
     def window(self) -> tuple[Array, Array]:
         """Lower left and upper right corner (2,) of what is seen, m in the world."""
-        half = np.array(self.middle) / self.scale
-        centre = np.array(self.centre)
-        return centre - half, centre + half
+        half = self._middle / self.scale
+        return self._centre - half, self._centre + half
 
     def sees(self, low: Array, high: Array) -> NDArray[np.intp]:
         """Indices of boxes, corners (n, 2) m, that overlap what is seen."""
@@ -98,6 +98,28 @@ def coloured_line(
                 surface, colours[start], left[start : k + 1] + right[start : k + 1][::-1]
             )
             start = k
+
+
+def clipped(polygon: Array, low: Array, high: Array) -> Array:
+    """A polygon's (n, 2) part within a box, corners (2,): (k, 2), of a concave one seamed.
+
+    Sutherland and Hodgman's: side by side of the box, what lies beyond is cut off.
+    """
+    for axis in (0, 1):
+        for sign, bound in ((1.0, low[axis]), (-1.0, high[axis])):
+            if len(polygon) == 0:
+                return polygon
+            inside = sign * (polygon[:, axis] - bound)
+            if (inside >= 0.0).all():
+                continue
+            following, after = np.roll(polygon, -1, axis=0), np.roll(inside, -1)
+            crosses = (inside >= 0.0) != (after >= 0.0)
+            share = np.where(crosses, inside / np.where(crosses, inside - after, 1.0), 0.0)
+            cut = polygon + share[:, None] * (following - polygon)
+            # Each corner that stays is followed by the place where its edge leaves or enters.
+            both = np.stack([polygon, cut], axis=1).reshape(-1, 2)
+            polygon = both[np.stack([inside >= 0.0, crosses], axis=1).ravel()]
+    return polygon
 
 
 def boxes(lines: Sequence[Array]) -> tuple[Array, Array]:
