@@ -139,7 +139,7 @@ def _speed(add: Add) -> None:
     speed.add_argument(
         "--only", nargs="+", default=[], metavar="SECTION",
         help="default: all of single, vector, conditions, learning, training, solvers, policies, "
-        "horizons, batches, wild, loops, tuning, memory, startup",
+        "horizons, batches, wild, loops, tuning, rendering, memory, startup",
     )  # fmt: skip
     speed.add_argument("--quick", action="store_true", help="tiny: shows that it works, no more")
 
