@@ -36,13 +36,19 @@ def agent_notes(name: str, info: dict[str, Any]) -> dict[str, str]:
     """
     notes, told = {"agent": name}, info.get("agent", {})
     if "status" in told:
-        notes["solver"] = f"{told['status']}, {told['iterations']} iterations"
+        count = told["iterations"]
+        notes["solver"] = f"{told['status']}, {count} iteration{'' if count == 1 else 's'}"
         # Always a row, so that the card keeps its size.
         notes["fallback"] = told.get("fallback") or "none"
     if told.get("weights") is not None:
         q, s, r = np.split(np.asarray(told["weights"]), (4, 8))
         for label, values in (("Q", q), ("S", s), ("R", r)):
-            notes[label] = "   ".join(f"{value:.3g}" for value in values)
+            notes[label] = "   ".join(_short(value) for value in values)
     if info.get("stopping"):
         notes["vehicle"] = "brakes by itself"
     return notes
+
+
+def _short(value: float) -> str:
+    """Write a weight in two digits, those from 100 to 9999 whole."""
+    return f"{value:.0f}" if 100.0 <= value < 1e4 else f"{value:.2g}"

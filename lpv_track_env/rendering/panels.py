@@ -35,8 +35,8 @@ Array = NDArray[np.float64]
 
 CARD_WIDTH, ROW = 224, 17
 """Pixels of the frame."""
-LABEL = 66
-"""Pixels of a row's label; its value follows."""
+LABEL, NOTE_LABEL = 66, 54
+"""Pixels of a row's label, of ours and of an agent's; its value follows."""
 MOST_NOTES = 9
 """Rows of an agent's card: more would reach the charts."""
 BANDS = CurvatureBands()
@@ -111,13 +111,12 @@ class Cards:
             panel = card(CARD_WIDTH, 2 * PADDING + ROW * len(rows) - 3)
             for k, (label, value) in enumerate(rows):
                 at = SUPERSAMPLING * (PADDING + ROW * k - 2)
-                panel.blit(
-                    self._letters.fitted(label, LABEL - 4, FAINT, 11), (SUPERSAMPLING * PADDING, at)
-                )
-                room = CARD_WIDTH - 2 * PADDING - LABEL
+                word = self._letters.fitted(label, NOTE_LABEL - 4, FAINT, 11)
+                panel.blit(word, (SUPERSAMPLING * PADDING, at))
+                room = CARD_WIDTH - 2 * PADDING - NOTE_LABEL
                 panel.blit(
                     self._letters.fitted(value, room, INK, 11),
-                    (SUPERSAMPLING * (PADDING + LABEL), at),
+                    (SUPERSAMPLING * (PADDING + NOTE_LABEL), at),
                 )
             self._notes = (dict(notes), panel)
         place = (SUPERSAMPLING * MARGIN, SUPERSAMPLING * (top + MARGIN // 2))

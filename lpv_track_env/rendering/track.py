@@ -29,6 +29,8 @@ PATH_WIDTH = 4.5
 """Pixels of the frame."""
 EVERY = 2
 """Of the path's nodes, 0.25 m apart, every second is drawn: half a metre is 10 pixels."""
+TURN, LONGEST = 0.05, 15.0
+"""rad and m: the corridor is drawn in pieces that turn no more and are no longer."""
 MAP_SIZE, LEGEND_HEIGHT = (184, 132), 42
 """Pixels of the card with map and legend."""
 
@@ -53,8 +55,9 @@ class Track:
         self._line = np.column_stack([path.x, path.y])[nodes]
         self._normals = np.column_stack([-np.sin(path.heading), np.cos(path.heading)])[nodes]
         self._reach = min(half_width, WIDEST_CORRIDOR)
-        self._left = self._line + self._reach * self._normals
-        self._right = self._line - self._reach * self._normals
+        kept = _turning(path.heading[nodes], path.arc_length[nodes])
+        self._middle, aside = self._line[kept], self._reach * self._normals[kept]
+        self._left, self._right = self._middle + aside, self._middle - aside
         values = path.speed if colour == "speed" else np.abs(path.curvature)
         low, high = float(values.min()), float(values.max())
         share = (values - low) / (high - low) if high - low > 1e-6 else np.full(len(values), 0.5)
@@ -65,15 +68,10 @@ class Track:
 
     def draw(self, surface: pygame.Surface, view: View, *, corridor: bool) -> None:
         """Draw what a view sees of the path, and of its corridor."""
-        reach = (self._reach if corridor else 0.0) + 2.0
-        low, high = view.window()
-        inside = ((self._line > low - reach) & (self._line < high + reach)).all(axis=1)
-        indices = np.flatnonzero(inside)
-        runs = np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
         if corridor:
-            self._draw_corridor(surface, view, runs)
+            self._draw_corridor(surface, view)
         across = self._normals * (1.0, -1.0)
-        for run in runs:
+        for run in _stays(self._line, view, 2.0):
             if len(run) > 1:
                 colours = [self._colours[k] for k in run]
                 points = view.pixels(self._line[run])
@@ -82,9 +80,8 @@ class Track:
         if not self._closed:
             self._draw_finish(surface, view)
 
-    def _draw_corridor(
-        self, surface: pygame.Surface, view: View, runs: list[NDArray[np.intp]]
-    ) -> None:
+    def _draw_corridor(self, surface: pygame.Surface, view: View) -> None:
+        runs = _stays(self._middle, view, self._reach + LONGEST)
         sides = [(view.pixels(self._left[run]), view.pixels(self._right[run])) for run in runs]
         # All edges lie under all surfaces, so that those within the corridor do not show.
         for left, right in sides:
@@ -92,9 +89,9 @@ class Track:
                 polyline(surface, CORRIDOR_EDGE, side, 3.0 * SUPERSAMPLING)
         for left, right in sides:
             ours, theirs = left.tolist(), right.tolist()
-            for k in range(0, len(ours) - 1, 2):
-                end = min(k + 2, len(ours) - 1)
-                pygame.draw.polygon(surface, CORRIDOR, (ours[k], ours[end], theirs[end], theirs[k]))
+            for k in range(len(ours) - 1):
+                corners = (ours[k], ours[k + 1], theirs[k + 1], theirs[k])
+                pygame.draw.polygon(surface, CORRIDOR, corners)
 
     def _draw_finish(self, surface: pygame.Surface, view: View) -> None:
         """A chequered line across the end."""
@@ -154,3 +151,20 @@ class Track:
         self.overview.blit(letters.render(f"{low:.{digits}f}", INK, 10), (left, top))
         number = letters.render(f"{high:.{digits}f}", INK, 10)
         self.overview.blit(number, (right - number.get_width(), top))
+
+
+def _turning(heading: Array, arc_length: Array) -> NDArray[np.intp]:
+    """Indices of the nodes that a path's turns need, the first and the last among them."""
+    kept = [0]
+    for k in range(1, len(heading) - 1):
+        turned = abs(heading[k + 1] - heading[kept[-1]])
+        if turned > TURN or arc_length[k + 1] - arc_length[kept[-1]] > LONGEST:
+            kept.append(k)
+    return np.array([*kept, len(heading) - 1])
+
+
+def _stays(points: Array, view: View, margin: float) -> list[NDArray[np.intp]]:
+    """Unbroken runs of the points (n, 2) m that a view sees, or has within a margin (m)."""
+    low, high = view.window()
+    indices = np.flatnonzero(((points > low - margin) & (points < high + margin)).all(axis=1))
+    return np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
