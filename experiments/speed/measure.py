@@ -53,8 +53,8 @@ class Effort:
     batches: tuple[int, ...] = (1, 4, 16, 64, 256, 1024)
     wild: int = 6000
     """Wild observations for each vehicle."""
-    frames: int | None = None
-    """Frames of a drive that are drawn; None for all."""
+    frames: int = 5000
+    """Frames of a drive that are drawn at most."""
     processes: int = 3
     """Fresh processes of a kind."""
     cold: bool = True

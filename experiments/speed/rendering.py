@@ -28,7 +28,7 @@ def rendering(section: Section, effort: Effort, tick: Tick) -> None:
         series.rounds.append(time.perf_counter() - began)
         if k % 100 == 0:
             tick(f"frames of a drive: {k}")
-        if k == effort.frames:
+        if k >= effort.frames:
             break
     height, width = frame.shape[:2]
     total = float(np.sum(series.rounds))
