@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.weights import in_words
 from lpv_track_env.bicycle import PSI, X, Y
 
 Array = NDArray[np.float64]
@@ -41,14 +42,7 @@ def agent_notes(name: str, info: dict[str, Any]) -> dict[str, str]:
         # Always a row, so that the card keeps its size.
         notes["fallback"] = told.get("fallback") or "none"
     if told.get("weights") is not None:
-        q, s, r = np.split(np.asarray(told["weights"]), (4, 8))
-        for label, values in (("Q", q), ("S", s), ("R", r)):
-            notes[label] = "   ".join(_short(value) for value in values)
+        notes |= in_words(told["weights"])
     if info.get("stopping"):
         notes["vehicle"] = "brakes by itself"
     return notes
-
-
-def _short(value: float) -> str:
-    """Write a weight in two digits, those from 100 to 9999 whole."""
-    return f"{value:.0f}" if 100.0 <= value < 1e4 else f"{value:.2g}"

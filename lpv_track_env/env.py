@@ -434,10 +434,13 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer.begin(self.task)
         return self._renderer
 
-    def draw(self, task: Task, memory: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Draw an episode that is not this environment's own: a frame (600, 900, 3) uint8."""
+    def draw(
+        self, task: Task, memory: NDArray[np.float64], notes: Mapping[str, str] | None = None
+    ) -> NDArray[np.uint8]:
+        """Draw an episode, and `notes`, that are not this environment's own: (600, 900, 3) uint8."""
         renderer = self._open_renderer("rgb_array")
         renderer.begin(task)
+        renderer.notes = notes or {}
         frame = renderer.draw(memory)
         assert frame is not None
         return frame
@@ -445,14 +448,9 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def show_agent(
         self, plan: NDArray[np.float64] | None = None, notes: Mapping[str, str] | None = None
     ) -> None:
-        """Give the renderer what an agent shows in the frames to come, in place of what it showed.
+        """Draw what an agent shows from now on, in place of what it showed.
 
-        Parameters
-        ----------
-        plan
-            Predicted positions, (n, 2) m in the world.
-        notes
-            Words by label, such as the weights in use, a row each.
+        `plan`: predicted positions, (n, 2) m in the world; `notes`: words by label, a row each.
         """
         if self.render_mode is not None:
             renderer = self._open_renderer(self.render_mode)

@@ -12,6 +12,7 @@ import pygame
 import pytest
 from numpy.typing import NDArray
 
+from agents.weights import in_words
 from experiments import drive, sinks
 from experiments.agent_words import agent_notes
 from experiments.cli import main
@@ -255,6 +256,10 @@ def test_notes_hold_what_is_in_use_and_no_time() -> None:
     assert notes["agent"] == "mine"
     assert notes == agent_notes("mine", {"agent": {**told, "seconds": 2.0}})
     assert agent_notes("pid", {"agent": {}}) == {"agent": "pid"}
+    wide = [1e-4, 0.12345, 12.3, 123.4, 9999.0, 1e6, 0.0, 1.0, 0.01, 10.0]
+    assert " ".join(in_words(wide).values()).split() == [
+        "0.0001", "0.12", "12", "123", "9999", "1e+06", "0", "1", "0.01", "10"
+    ]  # fmt: skip
 
 
 def test_gymnasium_records_videos(tmp_path: Path) -> None:
