@@ -437,7 +437,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def draw(
         self, task: Task, memory: NDArray[np.float64], notes: Mapping[str, str] | None = None
     ) -> NDArray[np.uint8]:
-        """Draw an episode, and `notes`, that are not this environment's own: (600, 900, 3) uint8."""
+        """Draw an episode and `notes` that are not this environment's own: (600, 900, 3) uint8."""
         renderer = self._open_renderer("rgb_array")
         renderer.begin(task)
         renderer.notes = notes or {}
