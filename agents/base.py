@@ -164,8 +164,8 @@ class TrackingAgent(ABC, Generic[Memory]):
     def diagnostics(self, memory: Memory) -> dict[str, Any]:  # noqa: ARG002  for subclasses
         """What the agent can tell of its last step for one vehicle; empty if nothing.
 
-        Known entries: status, seconds, iterations, cost, slack (3,), fallback, plan (n, 2) in the
-        frame of the path's foot point.
+        Known entries: status, seconds, iterations, cost, slack (3,), fallback, weights (10,),
+        plan (n, 2) in the frame of the path's foot point.
         """
         return {}
 

@@ -192,3 +192,17 @@ class WeightSchedule:
         except (OSError, ValueError, RecursionError) as error:
             reason = " ".join(str(error).split())
             raise ValueError(f"weight schedule {file}: {reason}") from error
+
+
+def in_words(weights: ArrayLike) -> dict[str, str]:
+    """Weights (10,) in words of two digits for a picture, a row each: Q, S, R."""
+    q, s, r = np.split(np.asarray(weights, dtype=np.float64), (4, 8))
+    return {
+        label: "   ".join(_short(value) for value in values.tolist())
+        for label, values in (("Q", q), ("S", s), ("R", r))
+    }
+
+
+def _short(value: float) -> str:
+    """Write two digits, of numbers from 100 to 9999 all."""
+    return f"{value:.0f}" if 100.0 <= value < 1e4 else f"{value:.2g}"

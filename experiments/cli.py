@@ -40,8 +40,11 @@ def _drive(options: argparse.Namespace, console: Any) -> int:
     from experiments.cases import Case
     from experiments.drive import drive
 
+    if options.agent is not None and options.agents:
+        raise ValueError("give --agent or --agents, not both")
+    names = options.agents or [options.agent or "lpv-nmpc"]
     case = Case(
-        agent=options.agent,
+        agent=names[0],
         trajectory=options.trajectory,
         vehicle=options.vehicle,
         speed_mode=options.speed_mode,
@@ -50,8 +53,10 @@ def _drive(options: argparse.Namespace, console: Any) -> int:
         agent_settings=parse_settings(options.agent_set),
         env_settings=parse_settings(options.env),
     )
-    case.check()
-    return drive(case, console, frames=options.frames, every=options.every)
+    return drive(
+        case, console, names=names, frames=options.frames, every=options.every,
+        video=options.video, fps=options.fps, speed_up=options.speed_up, colour=options.colour,
+    )  # fmt: skip
 
 
 def _speed(options: argparse.Namespace, console: Any) -> int:

@@ -1,92 +1,200 @@
-"""`lpv-track drive`: watch one run live, or write its frames."""
+"""`lpv-track drive`: watch a run live, write frames or a video, agents side by side."""
 
-import math
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from experiments.agent_words import agent_notes, world_plan
 from experiments.cases import Case
 from experiments.interrupts import Interrupts
-from experiments.rollout import rollout
-from lpv_track_env.bicycle import PSI, X, Y
+from experiments.rollout import Rollout, steps
+from experiments.sinks import PngSink, Sink, VideoSink, WindowSink
 
-Array = NDArray[np.float64]
+Frame = NDArray[np.uint8]
+
+SEAM = (224, 228, 234)
+"""Colour of the line between frames side by side."""
 
 
-def world_plan(info: dict[str, Any]) -> Array | None:
-    """An agent's predicted positions (n, 2) m in the world, from the foot point's frame.
+class Drive:
+    """One agent's drive of a case, step by step, and its picture.
 
-    The frame belongs to the step that has just been driven: the foot point is found back from the
-    plan's own start, which is the vehicle, so the plan is drawn from where the vehicle now is.
+    Parameters
+    ----------
+    case
+        What is driven.
+    colour
+        What the path is coloured by, see `lpv_track_env.rendering.Renderer`.
     """
-    plan = info.get("agent", {}).get("plan")
-    if plan is None or len(plan) < 3:
-        return None
-    state = info["state"]
-    heading = state[PSI] - info["heading_error"]
-    c, s = math.cos(heading), math.sin(heading)
-    ahead = np.asarray(plan)[1:] - np.asarray(plan)[1]
-    return np.column_stack(
-        [state[X] + c * ahead[:, 0] - s * ahead[:, 1], state[Y] + s * ahead[:, 0] + c * ahead[:, 1]]
-    )
+
+    def __init__(self, case: Case, colour: str) -> None:
+        self.case = case
+        self._env = case.make_env(render_mode="rgb_array", render_colour=colour)
+        self._inner: Any = self._env.unwrapped
+        agent = case.make_agent(self._env)
+        self._steps: Iterator[tuple[int, dict[str, Any]]] = self._drive(agent)
+        self._frame: Frame | None = None
+        self.done: Rollout | None = None
+        """Once it has ended."""
+
+    @property
+    def expected_steps(self) -> int:
+        """Steps that the reference itself would take."""
+        return max(round(float(self._inner.path.duration / self._inner.control_period)), 1)
+
+    @property
+    def finished(self) -> bool:
+        """Whether it has come to the end of the path."""
+        return self.done is not None and self.done.end == "finished"
+
+    def _drive(self, agent: Any) -> Iterator[tuple[int, dict[str, Any]]]:
+        self.done = yield from steps(
+            self._env, agent, seed=self.case.seed, computing_time=self.case.make_computing()
+        )
+
+    def advance(self) -> bool:
+        """Drive one control period; False once the episode has ended."""
+        for _, info in self._steps:
+            self._frame = None
+            self._inner.show_agent(world_plan(info), agent_notes(self.case.agent, info))
+            return True
+        return False
+
+    def frame(self) -> Frame:
+        """The picture now, (600, 900, 3); of a drive that has ended, the last."""
+        if self._frame is None:
+            self._frame = self._inner.render()
+        return self._frame
+
+    def close(self) -> None:
+        """Free what drawing took."""
+        self._env.close()
 
 
-def drive(case: Case, console: Console, *, frames: Path | None = None, every: int = 1) -> int:
-    """Drive one case and show it; write a PNG every `every` steps instead if `frames` is given.
+def drive(
+    case: Case,
+    console: Console,
+    *,
+    names: Sequence[str] = (),
+    frames: Path | None = None,
+    every: int = 1,
+    video: Path | None = None,
+    fps: float | None = None,
+    speed_up: float = 1.0,
+    colour: str = "speed",
+) -> int:
+    """Drive a case and show it, or write frames or a video; 0 if every agent has finished.
+
+    Parameters
+    ----------
+    case
+        What is driven.
+    console
+        Where the outcome and, on a terminal, the progress are told.
+    names
+        Agents that drive the case side by side; empty: the case's own. Who ends before the others
+        stays in the picture.
+    frames, every
+        Folder of PNG files, one every so many steps.
+    video, fps, speed_up
+        File of a video, .mp4 or .gif, its frames a second (by default one frame a control period,
+        at most 50) and how many times faster than the drive it runs. Its last frame stays for a
+        second.
+    colour
+        What the path is coloured by: "speed" or "curvature".
 
     Raises
     ------
     ValueError
-        If `every` is not positive, or there is nothing to draw on.
+        If `every`, `fps` or `speed_up` make no sense, both frames and a video are asked for, or
+        there is nothing to draw on.
+    ModuleNotFoundError
+        In one line that names the extra to install, for a video without an encoder.
     """
+    sink = _sink(case.control_period, frames, every, video, fps, speed_up)
+    cases = [replace(case, agent=name) for name in names or (case.agent,)]
+    for one in cases:
+        one.check()
+    with ExitStack() as stack:
+        # First of all, so that what drawing lacks is told at once.
+        stack.enter_context(sink)
+        drives = [Drive(one, colour) for one in cases]
+        for driven in drives:
+            stack.callback(driven.close)
+        with Interrupts() as interrupts, _progress(console, live=sink.live) as progress:
+            bar = progress.add_task("drive", total=max(driven.expected_steps for driven in drives))
+            for _ in play(drives, sink):
+                interrupts.check()
+                progress.advance(bar)
+    for driven in drives:
+        _tell(driven, console)
+    if sink.outcome:
+        console.print(sink.outcome, markup=False, highlight=False, soft_wrap=True)
+    return 0 if all(driven.finished for driven in drives) else 1
+
+
+def play(drives: Sequence[Drive], sink: Sink) -> Iterator[int]:
+    """Drive all of them into a sink, until the last has ended; yields each step's number."""
+    step = 0
+    # A list, not a generator: every one of them is to be driven.
+    while any([one.advance() for one in drives]):  # noqa: C419
+        step += 1
+        if times := sink.copies(step):
+            sink.add(step, beside([one.frame() for one in drives]), times)
+        yield step
+    sink.end(lambda: beside([one.frame() for one in drives]))
+
+
+def beside(frames: Sequence[Frame]) -> Frame:
+    """Frames (height, width, 3) side by side, a thin line between them."""
+    if len(frames) == 1:
+        return frames[0]
+    picture: Frame = np.concatenate(frames, axis=1)
+    for k in range(1, len(frames)):
+        seam = k * frames[0].shape[1]
+        picture[:, seam - 1 : seam + 1] = SEAM
+    return picture
+
+
+def _sink(
+    period: float, frames: Path | None, every: int, video: Path | None, fps: float | None,
+    speed_up: float,
+) -> Sink:  # fmt: skip
+    """Where the frames go, as `drive` is told."""
     if every < 1:
         raise ValueError(f"--every must be at least 1, not {every}")
-    env = case.make_env(render_mode="human" if frames is None else "rgb_array")
-    agent = case.make_agent(env)
-    inner: Any = env.unwrapped
-    count = 0
+    if frames is not None and video is not None:
+        raise ValueError("give --frames or --video, not both")
+    if video is None and (fps is not None or speed_up != 1.0):
+        raise ValueError("--fps and --speed-up are for --video FILE")
+    if video is not None:
+        return VideoSink(video, period, fps, speed_up)
     if frames is not None:
-        frames.mkdir(parents=True, exist_ok=True)
+        return PngSink(frames, every)
+    return WindowSink(max(round(1.0 / period), 1))
 
-    def show(step: int, info: dict[str, Any]) -> None:
-        nonlocal count
-        interrupts.check()
-        inner.show_plan(world_plan(info))
-        if frames is not None and step % every == 0:
-            save(inner.render(), frames / f"frame-{step:06d}.png")
-            count += 1
 
-    try:
-        # Before the run, so that what drawing lacks is told at once.
-        env.reset(seed=case.seed)
-        inner.render()
-    except RuntimeError as error:
-        raise ValueError(str(error)) from error
-    with Interrupts() as interrupts:
-        done = rollout(env, agent, seed=case.seed, on_step=show)
-    worst = float(np.abs(done.trace.lateral_error).max())
-    where = "" if frames is None else f"; {count} frames in {frames}"
+def _progress(console: Console, *, live: bool) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} steps"),
+        TimeElapsedColumn(), console=console, disable=live or not console.is_terminal,
+        transient=True,
+    )  # fmt: skip
+
+
+def _tell(one: Drive, console: Console) -> None:
+    assert one.done is not None
+    trace = one.done.trace
+    worst = float(np.abs(trace.lateral_error).max())
     console.print(
-        f"{case.agent} on {case.trajectory}: {done.end} after {done.trace.time[-1]:.1f} s, "
-        f"largest lateral error {worst:.3f} m{where}",
+        f"{one.case.agent} on {one.case.trajectory}: {one.done.end} after {trace.time[-1]:.1f} s, "
+        f"largest lateral error {worst:.3f} m",
         markup=False, highlight=False, soft_wrap=True,
     )  # fmt: skip
-    env.close()
-    return 0 if done.end == "finished" else 1
-
-
-def save(frame: NDArray[np.uint8], file: Path) -> None:
-    """Write a frame (height, width, 3) as PNG, atomically."""
-    import io
-
-    import pygame
-
-    from trajectories.atomic import write_atomically
-
-    surface = pygame.surfarray.make_surface(frame.swapaxes(0, 1))
-    buffer = io.BytesIO()
-    pygame.image.save(surface, buffer, "frame.png")
-    write_atomically(file, buffer.getvalue())

@@ -79,10 +79,13 @@ def _report(add: Add) -> None:
 def _drive(add: Add) -> None:
     drive = add(
         "drive",
-        "Watch one run live, or write its frames.",
-        "lpv-track drive --agent lpv-nmpc --trajectory T2 --frames frames --every 4",
+        "Watch a run live, or write its frames or a video; several agents side by side.",
+        "lpv-track drive --agents lpv-nmpc pure-pursuit --trajectory T2 --video out.mp4",
     )
-    drive.add_argument("--agent", default="lpv-nmpc", metavar="NAME")
+    drive.add_argument("--agent", metavar="NAME", help="default: lpv-nmpc")
+    drive.add_argument(
+        "--agents", nargs="+", metavar="NAME", help="drive the same case, side by side"
+    )
     drive.add_argument("--trajectory", default="T2", metavar="NAME")
     drive.add_argument("--vehicle", default="m2-minibus", metavar="NAME")
     drive.add_argument("--speed-mode", default="variable", choices=["variable", "fixed"])
@@ -95,6 +98,22 @@ def _drive(add: Add) -> None:
         "--frames", type=Path, metavar="DIR", help="write PNG frames, open no window"
     )
     drive.add_argument("--every", type=int, default=1, metavar="N", help="a frame every N steps")
+    drive.add_argument(
+        "--video", type=Path, metavar="FILE",
+        help="write a video, .mp4 or .gif; needs pip install 'lpv-track-env[video]'",
+    )  # fmt: skip
+    drive.add_argument(
+        "--fps", type=float, metavar="N",
+        help="frames a second of the video (default: one a control period, at most 50)",
+    )  # fmt: skip
+    drive.add_argument(
+        "--speed-up", type=float, default=1.0, metavar="X",
+        help="how many times faster than real time the video runs (default 1)",
+    )  # fmt: skip
+    drive.add_argument(
+        "--colour", default="speed", metavar="WHAT",
+        help="of the path: speed (default) or curvature",
+    )  # fmt: skip
 
 
 def _paths(add: Add) -> None:
@@ -120,7 +139,7 @@ def _speed(add: Add) -> None:
     speed.add_argument(
         "--only", nargs="+", default=[], metavar="SECTION",
         help="default: all of single, vector, conditions, learning, training, solvers, policies, "
-        "horizons, batches, wild, loops, tuning, memory, startup",
+        "horizons, batches, wild, loops, tuning, rendering, memory, startup",
     )  # fmt: skip
     speed.add_argument("--quick", action="store_true", help="tiny: shows that it works, no more")
 

@@ -1,7 +1,7 @@
 """One episode: an agent drives an environment, and everything worth knowing is recorded."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -76,7 +76,30 @@ def rollout(
 ) -> Rollout:
     """Drive one episode from reset to its end.
 
-    `on_step(k, info)` is called after each step, with the agent's diagnostics under "agent".
+    `on_step(k, info)` is called after each step, with the agent's diagnostics under "agent"; for
+    the rest see `steps`.
+    """
+    driving = steps(env, agent, seed, options, computing_time)
+    while True:
+        try:
+            k, info = next(driving)
+        except StopIteration as end:
+            done: Rollout = end.value
+            return done
+        if on_step is not None:
+            on_step(k, info)
+
+
+def steps(
+    env: gymnasium.Env[Any, Any],
+    agent: Agent,
+    seed: int | None = None,
+    options: dict[str, Any] | None = None,
+    computing_time: Callable[[int, float], tuple[float, float]] | None = None,
+) -> Generator[tuple[int, dict[str, Any]], None, Rollout]:
+    """Drive one episode step by step, for who drives several at a time.
+
+    Yields each step's number, from 1, and its info with the agent's diagnostics under "agent".
     `computing_time(k, seconds)`, given the time that the agent just took, says what passes until
     the action of step k lands and until the next may be computed (s, s), see
     `PathTrackingEnv.set_computing_time`. While the agent is busy with an earlier action it is not
@@ -143,8 +166,7 @@ def rollout(
             iterations.append(told["iterations"])
             if told["slack"] is not None:
                 slack = np.maximum(slack, told["slack"])
-        if on_step is not None:
-            on_step(len(rows) - 1, {**info, "agent": told})
+        yield len(rows) - 1, {**info, "agent": told}
     table = np.array(rows).T
     trace = Trace(
         period * np.arange(len(rows)),

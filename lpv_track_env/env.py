@@ -133,6 +133,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         (`lpv_track_env.plants`): "single-track", "drift", "multi-body", for the vehicles
         `ford-escort`, `bmw-320i`, `vw-vanagon`; or a function of `VehicleParameters` that makes a
         `Plant`. A step with these costs 20 to 200 times as much, more below 2 m/s.
+    render_colour
+        What frames colour the path by: "speed", the reference's, or "curvature".
 
     ## Version history
 
@@ -163,7 +165,9 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
         random_start: bool = False,
         plant: str | plants.Factory = plants.BICYCLE,
+        render_colour: str = "speed",
     ) -> None:
+        self._render_colour = choose("render_colour", render_colour, ("speed", "curvature"))
         if render_mode is not None:
             choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
         self.render_mode = render_mode
@@ -334,8 +338,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if plant is not None:
             plant.begin(self._memory)
         self._running = True
-        if self._renderer is not None:
-            self._renderer.begin(task)
+        self._begin_drawing()
         if self.render_mode == "human":
             self.render()
         info = single_info(self._memory)
@@ -421,26 +424,40 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             )
         return self._open_renderer(self.render_mode).draw(self._memory)
 
+    def _begin_drawing(self) -> None:
+        """Tell the renderer, if there is one, of a new episode."""
+        if self._renderer is not None:
+            self._renderer.begin(self.task)
+
     def _open_renderer(self, render_mode: str) -> "Renderer":
         if self._renderer is None:
             from lpv_track_env.rendering import Renderer
 
-            self._renderer = Renderer(render_mode, self.metadata["render_fps"])
-            self._renderer.begin(self.task)
+            self._renderer = Renderer(render_mode, self.metadata["render_fps"], self._render_colour)
+            self._begin_drawing()
         return self._renderer
 
-    def draw(self, task: Task, memory: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Draw an episode that is not this environment's own: a frame (600, 900, 3) uint8."""
+    def draw(
+        self, task: Task, memory: NDArray[np.float64], notes: Mapping[str, str] | None = None
+    ) -> NDArray[np.uint8]:
+        """Draw an episode and `notes` that are not this environment's own: (600, 900, 3) uint8."""
         renderer = self._open_renderer("rgb_array")
         renderer.begin(task)
+        renderer.notes = notes or {}
         frame = renderer.draw(memory)
         assert frame is not None
         return frame
 
-    def show_plan(self, plan: NDArray[np.float64] | None) -> None:
-        """Give the renderer an agent's predicted positions, (n, 2) m, to draw in the next frame."""
+    def show_agent(
+        self, plan: NDArray[np.float64] | None = None, notes: Mapping[str, str] | None = None
+    ) -> None:
+        """Draw what an agent shows from now on, in place of what it showed.
+
+        `plan`: predicted positions, (n, 2) m in the world; `notes`: words by label, a row each.
+        """
         if self.render_mode is not None:
-            self._open_renderer(self.render_mode).plan = plan
+            renderer = self._open_renderer(self.render_mode)
+            renderer.plan, renderer.notes = plan, notes or {}
 
     def close(self) -> None:
         """Close the window, if any."""

@@ -1,7 +1,7 @@
 """Many path tracking environments stepped at once, in compiled code."""
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -419,8 +419,15 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
                 "reset(options={'reset_mask': mask}) before step()"
             )
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+    def render(
+        self, notes: Sequence[Mapping[str, str]] | None = None
+    ) -> tuple[NDArray[np.uint8], ...] | None:
         """Draw every environment: n frames (600, 900, 3) uint8, without trails.
+
+        Parameters
+        ----------
+        notes
+            Of each environment, as in `PathTrackingEnv.show_agent`.
 
         Raises
         ------
@@ -432,7 +439,10 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             return None
         self._check_begun()
         return tuple(
-            self._single.draw(self.task_of(i), self._memories[i]) for i in range(self.num_envs)
+            self._single.draw(
+                self.task_of(i), self._memories[i], None if notes is None else notes[i]
+            )
+            for i in range(self.num_envs)
         )
 
     def close_extras(self, **_: Any) -> None:

@@ -440,7 +440,9 @@ def test_schedule_by_band_and_by_path(nmpc: tuple[gymnasium.Env, Any]) -> None:
     for s in (0.0, 45.0):
         observation, _ = env.reset(options={"arc_length": s})
         _, memory = by_band.predict(observation, episode_start=np.array([True]))
-        bands.add(int(memory.bands[0] if hasattr(memory, "bands") else memory[0].band[0]))
+        bands.add(band := int(memory.bands[0] if hasattr(memory, "bands") else memory[0].band[0]))
+        told = by_band.diagnostics(memory[0])["weights"]
+        np.testing.assert_array_equal(told, sets[band].as_array())
     assert bands == {0, 3}
 
 

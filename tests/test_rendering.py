@@ -13,10 +13,17 @@ import pygame
 import pytest
 from numpy.typing import NDArray
 
-from lpv_track_env import kernels, rendering
+from lpv_track_env import kernels
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.registration import PATH_TRACKING
-from lpv_track_env.rendering import HEIGHT, WIDTH, Renderer
+from lpv_track_env.rendering import COLOURINGS, HEIGHT, WIDTH, Renderer, Scenery, style
+from lpv_track_env.rendering.camera import MIDDLE, ROOM, Camera
+from lpv_track_env.rendering.charts import signals_of
+from lpv_track_env.rendering.forces import axle_forces
+from lpv_track_env.rendering.style import SCENE_HEIGHT
+from lpv_track_env.rendering.vehicles import ackermann
+from lpv_track_env.rendering.view import View, clipped
+from lpv_track_env.vehicle import VEHICLES
 
 Frame = NDArray[np.uint8]
 ACTION = np.array([0.8, 0.03], dtype=np.float32)
@@ -45,8 +52,24 @@ def frames(seed: int, steps: int = 20, **settings: Any) -> list[Frame]:
     return shots
 
 
-def near_vehicle(frame: Frame) -> Frame:
-    return frame[HEIGHT // 2 - 60 : HEIGHT // 2 + 60, WIDTH // 2 - 60 : WIDTH // 2 + 60]
+def scene(frame: Frame) -> Frame:
+    """The part without the charts."""
+    return frame[:SCENE_HEIGHT]
+
+
+def charts(frame: Frame) -> Frame:
+    return frame[SCENE_HEIGHT:]
+
+
+def count(frame: Frame, colour: tuple[int, int, int]) -> int:
+    """Pixels of a colour."""
+    return int((frame == colour).all(axis=2).sum())
+
+
+def places(frame: Frame, colour: tuple[int, int, int]) -> NDArray[np.intp]:
+    """Pixels (n, 2), x and y, of a colour."""
+    rows, columns = np.nonzero((frame == colour).all(axis=2))
+    return np.column_stack([columns, rows])
 
 
 @pytest.mark.parametrize("trajectory", ["T1", "T3-raw", "circle", "figure-eight", "straight"])
@@ -62,7 +85,8 @@ def test_a_frame_is_a_picture(trajectory: str, vehicle: str) -> None:
     # A light scene with something in it.
     assert 200.0 < frame.mean() < 250.0
     assert len(np.unique(frame.astype(np.uint32) @ np.uint32([65536, 256, 1]))) > 50
-    assert (near_vehicle(frame) == rendering.BODY).all(axis=2).sum() > 300
+    assert count(scene(frame), style.BODY) > 300
+    assert count(charts(frame), style.TRACE) > 0 or env._memory[kernels.STEPS] == 0
 
 
 def test_frames_change_over_time() -> None:
@@ -96,27 +120,54 @@ def test_drawing_does_not_touch_the_episode() -> None:
         np.testing.assert_array_equal(drawn.step(ACTION)[0], plain.step(ACTION)[0])
 
 
-def test_camera_follows_and_the_trail_stays() -> None:
+def test_trail_and_vehicle_stay_in_the_picture() -> None:
     env = make(trajectory="straight")
     env.reset(seed=0)
-    before = frame_of(env)
-    for _ in range(80):
+    trails = []
+    for k in range(160):
         env.step(np.array([0.8, 0.0], dtype=np.float32))
-        after = frame_of(env)
-    assert env.state[4] > 10.0
-    # The vehicle stays in the middle; behind it, on the left, the trail of 15 pixels a metre.
-    np.testing.assert_array_equal(
-        (near_vehicle(before) == rendering.BODY).all(axis=2),
-        (near_vehicle(after) == rendering.BODY).all(axis=2),
-    )
-    columns = (after == rendering.TRAIL).all(axis=2)[HEIGHT // 2 - 5 : HEIGHT // 2 + 5].any(axis=0)
-    length = int(columns[: WIDTH // 2].sum())
-    driven = min(env.state[4] * WIDTH / rendering.VIEW_WIDTH, WIDTH / 2)
-    body = 0.5 * env.vehicle.length * WIDTH / rendering.VIEW_WIDTH
-    assert length == pytest.approx(driven - body, abs=12)
+        if k % 40 == 39:
+            frame = scene(frame_of(env))
+            trails.append(np.ptp(places(frame, style.TRAIL)[:, 0]))
+            body = places(frame, style.BODY)
+            assert np.abs(body.mean(axis=0) - MIDDLE)[0] < ROOM[0] + 10.0
+            assert np.abs(body.mean(axis=0) - MIDDLE)[1] < 5.0
+    assert trails[0] < trails[1]
 
 
-def test_steered_wheels_and_numbers_are_drawn() -> None:
+def test_camera_moves_smoothly_and_looks_ahead() -> None:
+    """From frame to frame neither place nor scale jumps, also where the path does."""
+    env = make(trajectory="T3-raw")
+    env.reset(seed=0)
+    camera = Camera()
+    before: tuple[NDArray[np.float64], float] | None = None
+    for k in range(400):
+        s = 0.35 * k
+        x, y = (float(np.interp(s, env.path.arc_length, axis)) for axis in (env.path.x, env.path.y))
+        camera.follow(0.05 * k, 7.0, x, y, s, env.path)
+        view = camera.view(x, y)
+        vehicle = view.pixels(np.array([x, y])) / style.SUPERSAMPLING
+        offset = (vehicle - MIDDLE) / ROOM
+        assert np.hypot(*offset) <= 1.0 + 1e-9
+        if before is not None:
+            assert np.abs(vehicle - before[0]).max() < 6.0
+            assert view.scale == pytest.approx(before[1], rel=0.01)
+        before = vehicle, view.scale
+        if k == 0:
+            ahead = np.interp(s + 10.0, env.path.arc_length, env.path.x)
+            assert (vehicle[0] < MIDDLE[0]) == (ahead > x)
+
+
+def test_camera_is_further_away_at_speed() -> None:
+    env = make(trajectory="straight")
+    env.reset(seed=0)
+    slow, fast = Camera(), Camera()
+    slow.follow(0.0, 1.0, 0.0, 0.0, 0.0, env.path)
+    fast.follow(0.0, 15.0, 0.0, 0.0, 0.0, env.path)
+    assert fast.view(0.0, 0.0).scale < 0.7 * slow.view(0.0, 0.0).scale
+
+
+def test_steered_wheels_and_forces_are_drawn() -> None:
     env = make(trajectory="straight")
     env.reset(seed=0)
     renderer = Renderer("rgb_array", 20)
@@ -127,32 +178,130 @@ def test_steered_wheels_and_numbers_are_drawn() -> None:
     steered = renderer.draw(memory)
     assert straight is not None
     assert steered is not None
-    changed = (straight != steered).any(axis=2)
-    rows, columns = np.nonzero(changed)
-    # Only the front wheels, right of the middle on this path to the east, and the panel's number.
-    panel = columns < rendering.MARGIN + rendering.TEXT_WIDTH
-    assert panel.any()
-    wheels = ~panel
-    assert wheels.any()
-    assert columns[wheels].min() > WIDTH // 2
-    assert columns[wheels].max() < WIDTH // 2 + 40
-    assert np.abs(rows[wheels] - HEIGHT // 2).max() < 25
+    assert count(scene(straight), style.FORCE) == count(scene(steered), style.FORCE) - (
+        count(scene(steered)[: SCENE_HEIGHT - 60], style.FORCE)
+    )
+    # To the left of a path that leads east, at the front axle.
+    arrow = places(scene(steered)[: SCENE_HEIGHT - 60], style.FORCE)
+    body = places(scene(steered), style.BODY).mean(axis=0)
+    assert arrow[:, 0].max() > body[0] + 15.0
+    assert arrow[:, 1].min() < body[1] - 20.0
+    tyres = [count(scene(frame)[100:350, 300:700], style.TYRE) for frame in (straight, steered)]
+    assert tyres[0] != tyres[1]
+
+
+def test_the_wheels_axes_meet_on_the_rear_axles_line() -> None:
+    left, right = ackermann(0.3, 2.9, 1.5)
+    assert left > 0.3 > right
+    assert 2.9 / np.tan(left) + 0.75 == pytest.approx(2.9 / np.tan(right) - 0.75)
+    assert ackermann(0.0, 2.9, 1.5) == (0.0, 0.0)
+    assert ackermann(-0.3, 2.9, 1.5) == pytest.approx((-right, -left))
+
+
+@pytest.mark.parametrize("vehicle", ["m2-minibus", "course-car"])
+def test_axle_forces_are_those_of_linear_tyres(vehicle: str) -> None:
+    """The formulas of kumar2025lpv, which hold from 1 m/s upwards."""
+    car = VEHICLES[vehicle]
+    vx, vy, r, delta = 6.0, 0.2, 0.3, 0.15
+    found = axle_forces(vx, vy, r, delta, car)
+    front = delta - (vy + car.front_axle_distance * r) / vx
+    rear = -(vy - car.rear_axle_distance * r) / vx
+    assert found.front_slip == pytest.approx(front)
+    assert found.rear_slip == pytest.approx(rear)
+    assert found.front == pytest.approx(car.front_cornering_stiffness * front)
+    assert found.rear == pytest.approx(car.rear_cornering_stiffness * rear)
+    assert np.isfinite(axle_forces(0.0, 0.0, 0.0, 0.5, car)).all()
+
+
+def test_what_the_agent_shows_is_drawn_until_the_next_episode() -> None:
+    env = make(trajectory="straight")
+    env.reset(seed=0)
+    bare = frame_of(env)
+    notes = {"agent": "mine", "Q": "1   2   3   4", "a very long label": "words " * 30}
+    env.show_agent(notes=notes)
+    told = frame_of(env)
+    changed = np.argwhere((told != bare).any(axis=2))
+    # A card on the left, and nothing else.
+    assert len(changed) > 500
+    assert changed[:, 1].max() < 250
+    assert changed[:, 0].max() < SCENE_HEIGHT
+    env.show_agent(notes={str(k): "v" for k in range(100)})
+    assert frame_of(env).shape == bare.shape
+    env.reset(seed=0)
+    np.testing.assert_array_equal(frame_of(env), bare)
+
+
+def test_path_is_coloured_by_speed_or_curvature() -> None:
+    pictures = {}
+    for colour in COLOURINGS:
+        env = make(trajectory="T3", render_colour=colour)
+        env.reset(seed=0)
+        pictures[colour] = frame_of(env)
+    assert (pictures["speed"] != pictures["curvature"]).any()
+    shades = {colour: style.shades(colour, [0.0])[0] for colour in COLOURINGS}
+    # A path begins straight and slow: the least of both, on the map.
+    for colour, frame in pictures.items():
+        assert count(frame, shades[colour]) > 5
+        others = [shades[other] for other in COLOURINGS if other != colour]
+        assert all(count(frame, other) == 0 for other in others)
+    with pytest.raises(ValueError, match=r"unknown render_colour 'sped'.*nearest: speed"):
+        make(render_colour="sped")
+
+
+@pytest.mark.parametrize("vehicle", ["m2-minibus", "course-car", "ford-escort"])
+def test_charts_hold_what_they_show(vehicle: str) -> None:
+    env = make(trajectory="T2", vehicle=vehicle)
+    for signal in signals_of(env.task):
+        for largest in (0.0, 0.03, 4.0, 1e12):
+            low, high = signal.axis(np.array([-largest, 0.3 * largest]))
+            assert low < high
+            if signal.ends is not None and largest <= signal.ends[-1]:
+                assert low <= -largest
+        if signal.ends is None or signal.title == "steering":
+            low, high = signal.axis(np.array([max(signal.limits, default=0.0)]))
+            assert all(low < limit < high for limit in signal.limits)
+
+
+def test_frames_of_odd_episodes() -> None:
+    """Far from the path, at standstill, in reverse, spinning: a frame all the same."""
+    env = make(trajectory="T2")
+    env.reset(seed=0)
+    renderer = Renderer("rgb_array", 20)
+    for changes in (
+        {kernels.X: 1e5, kernels.Y: -1e5, kernels.LATERAL_ERROR: 1e5},
+        {0: 0.0, 6: 0.0},
+        {0: -8.0, 3: 5.0, kernels.HEADING_ERROR: 3.1},
+        {0: 80.0, 1: 40.0, 3: -20.0, kernels.ARC_LENGTH: 1e4},
+    ):
+        renderer.begin(env.task)
+        memory = env._memory.copy()
+        for entry, value in changes.items():
+            memory[entry] = value
+        frame = renderer.draw(memory)
+        assert frame is not None
+        assert 100.0 < frame.mean() < 255.0
+        memory[kernels.STEPS] += 400.0
+        again = renderer.draw(memory)
+        assert again is not None
 
 
 def test_plan_is_drawn_until_it_is_taken_away() -> None:
     env = make(trajectory="straight")
     env.reset(seed=0)
     plan = np.column_stack([np.linspace(5.0, 20.0, 20), np.linspace(0.0, 3.0, 20)])
-    env.show_plan(plan)  # before the first frame: it must not be lost
+    env.show_agent(plan)  # before the first frame: it must not be lost
     with_plan = frame_of(env)
-    assert (with_plan == rendering.PLAN).all(axis=2).sum() > 100
-    env.show_plan(None)
+    assert count(scene(with_plan), style.PLAN) > 100
+    env.show_agent()
     without = frame_of(env)
-    assert not (without == rendering.PLAN).all(axis=2).any()
+    assert not count(without, style.PLAN)
     for odd in (np.empty((0, 2)), np.full((3, 2), np.nan), np.full((2, 2), 1e12)):
-        env.show_plan(odd)
-        np.testing.assert_array_equal(frame_of(env), without)
-    env.show_plan(plan)
+        env.show_agent(odd)
+        # But for the key, which says what a plan looks like.
+        np.testing.assert_array_equal(
+            frame_of(env)[: SCENE_HEIGHT - 50], without[: SCENE_HEIGHT - 50]
+        )
+    env.show_agent(plan)
     env.reset(seed=0)
     np.testing.assert_array_equal(frame_of(env), without)
 
@@ -161,7 +310,7 @@ def test_end_is_written() -> None:
     env = make(trajectory="straight")
     env.reset(seed=0, options={"lateral_error": 6.0})
     env.step(ACTION)
-    assert (frame_of(env) == rendering.ALERT).all(axis=2).any()
+    assert count(scene(frame_of(env)), style.ALERT) > 20
 
 
 def test_close_twice_and_draw_again() -> None:
@@ -187,7 +336,7 @@ def test_an_environment_with_a_renderer_can_be_pickled() -> None:
 def test_no_render_mode_draws_nothing() -> None:
     env = make(None, trajectory="u-turn")
     env.reset(seed=0)
-    env.show_plan(np.zeros((3, 2)))
+    env.show_agent(np.zeros((3, 2)))
     with pytest.warns(UserWarning, match="needs render_mode"):
         assert env.render() is None
 
@@ -255,6 +404,23 @@ def test_closing_the_window_ends_the_drawing_not_the_run(event: tuple[int, dict[
 
 
 @pytest.mark.usefixtures("_offscreen")
+def test_space_pauses_and_a_resized_window_keeps_the_frames_shape() -> None:
+    env = make("human", trajectory="u-turn")
+    env.reset(seed=0)
+    space = pygame.event.Event(pygame.KEYDOWN, {"key": pygame.K_SPACE})
+    pygame.event.post(space)
+    pygame.event.post(space)  # else it would wait for it
+    env.step(ACTION)
+    assert pygame.display.get_caption()[0] == "lpv-track-env"
+    window = pygame.display.set_mode((500, 600), pygame.RESIZABLE)
+    env.step(ACTION)
+    shown = pygame.surfarray.array3d(window).swapaxes(0, 1)
+    assert (shown[:100] == 255).all()
+    assert (shown[150:400] != 255).any()
+    env.close()
+
+
+@pytest.mark.usefixtures("_offscreen")
 @pytest.mark.filterwarnings("error")
 def test_window_without_a_display_is_warned_of_once(monkeypatch: pytest.MonkeyPatch) -> None:
     # What SDL chooses by itself where there is no display, made sure of here.
@@ -297,3 +463,86 @@ def test_trail_holds_the_steps_between_frames() -> None:
         frames.append(frame)
         env.close()
     np.testing.assert_array_equal(frames[0], frames[1])
+
+
+# Roads and other vehicles ----------------------------------------------------------------------
+
+SQUARE = np.array([(-8.0, 6.0), (8.0, 6.0), (8.0, 14.0), (-8.0, 14.0)])
+
+
+def drawn(scenery: Scenery | None = None, others: NDArray[np.float64] | None = None) -> Frame:
+    """The start of the straight path, which leads east from the origin."""
+    env = make(trajectory="straight")
+    env.reset(seed=0)
+    renderer = Renderer("rgb_array", 20)
+    renderer.begin(env.task, scenery)
+    renderer.others = others
+    frame = renderer.draw(env._memory)
+    assert frame is not None
+    return frame
+
+
+def test_scenery_takes_the_corridors_place() -> None:
+    bare, road = drawn(Scenery([], [])), drawn(Scenery([SQUARE], []))
+    assert count(bare, style.ROAD) == 0
+    wide = count(road, style.ROAD)
+    assert wide > 1000
+    line = np.array([(-8.0, 10.0), (8.0, 10.0)])
+    solid, dashed = (count(drawn(Scenery([SQUARE], [(line, d)])), style.ROAD) for d in (0, 1))
+    assert solid < dashed < wide
+
+
+def test_scenery_out_of_sight_changes_nothing_and_much_of_it_is_left_out() -> None:
+    bare = drawn(Scenery([], []))
+    far = Scenery([SQUARE + 500.0], [(SQUARE + 500.0, False), (SQUARE - 500.0, True)])
+    np.testing.assert_array_equal(drawn(far), bare)
+    # Lines that pass through the picture from far away are cut, not dropped.
+    through = np.column_stack([np.linspace(-2000.0, 2000.0, 400), np.full(400, 9.0)])
+    assert (drawn(Scenery([], [(through, False)])) != bare).any()
+
+
+def test_scenery_that_cannot_be_drawn_is_one_line() -> None:
+    for bad in (SQUARE[:2], np.zeros((4, 3)), np.full((4, 2), np.nan)):
+        with pytest.raises(ValueError, match="a surface must be"):
+            drawn(Scenery([bad], []))
+    with pytest.raises(ValueError, match="a line must be"):
+        drawn(Scenery([], [(SQUARE[:1], False)]))
+
+
+def test_other_vehicles_are_drawn_while_set() -> None:
+    alone = drawn()
+    near = np.array([[6.0, 4.0, 0.3, 4.6, 1.9]])
+    assert count(drawn(others=near), style.OTHER) > 300
+    far, broken = near + 1000.0, near * np.nan
+    for unseen in (far, broken, np.empty((0, 5))):
+        np.testing.assert_array_equal(drawn(others=unseen), alone)
+    # Turned by a quarter it is as large, elsewhere.
+    turned = drawn(others=np.array([[6.0, 4.0, 0.3 + np.pi / 2, 4.6, 1.9]]))
+    assert abs(count(turned, style.OTHER) - count(drawn(others=near), style.OTHER)) < 200
+    with pytest.raises(ValueError, match=r"others must be \(m, 5\)"):
+        drawn(others=np.zeros((2, 4)))
+
+
+def test_a_polygon_is_cut_to_the_box() -> None:
+    low, high = np.array([0.0, 0.0]), np.array([10.0, 5.0])
+    everything = clipped(np.array([(-1e6, -1e6), (1e6, -1e6), (1e6, 1e6), (-1e6, 1e6)]), low, high)
+    assert area(everything) == pytest.approx(50.0)
+    inside = np.array([(1.0, 1.0), (3.0, 1.0), (2.0, 4.0)])
+    np.testing.assert_array_equal(clipped(inside, low, high), inside)
+    assert len(clipped(inside + 100.0, low, high)) == 0
+    half = clipped(inside - (2.0, 0.0), low, high)
+    assert area(half) == pytest.approx(0.5 * area(inside))
+
+
+def area(polygon: NDArray[np.float64]) -> float:
+    """Of a polygon (n, 2), by the shoelace formula."""
+    x, y = polygon.T
+    return abs(float(0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1))))
+
+
+def test_a_large_road_costs_nothing_out_of_sight() -> None:
+    """What is handed to pygame stays near the picture, however long the road is."""
+    view = View((0.0, 0.0), 20.0, (900.0, 456.0))
+    low, high = view.window()
+    road = np.array([(-1e5, -4.0), (1e5, -4.0), (1e5, 4.0), (-1e5, 4.0)])
+    assert np.abs(view.pixels(clipped(road, low - 5.0, high + 5.0))).max() < 4000.0

@@ -159,7 +159,7 @@ def test_actions_and_diagnostics_handed_out_are_copies() -> None:
         actions, memory = agent.predict(row)
         np.testing.assert_array_equal(actions, untouched.predict(row)[0])
         told = agent.diagnostics(memory[1])
-        for value in (actions, told["plan"], told["slack"]):
+        for value in (actions, told["plan"], told["slack"], told["weights"]):
             value[:] = 7.0
 
 
@@ -238,8 +238,12 @@ def test_schedule_by_band_chooses_for_every_row() -> None:
     rows, agent = drives(17, 1)[0], made(weights=schedule)
     actions, memory = agent.predict(rows)
     assert len(set(memory.bands)) > 1
-    for row, action, band in zip(rows, actions, memory.bands, strict=True):
-        np.testing.assert_array_equal(made(weights=sets[band]).predict(row)[0], action)
+    for k, (row, action, band) in enumerate(zip(rows, actions, memory.bands, strict=True)):
+        fixed = made(weights=sets[band])
+        wanted, alone = fixed.predict(row)
+        np.testing.assert_array_equal(wanted, action)
+        for told in (agent.diagnostics(memory[k]), fixed.diagnostics(alone[0])):
+            np.testing.assert_array_equal(told["weights"], sets[band].as_array())
     broken = rows.copy()
     broken[0, len(SCALARS)] = np.nan
     assert np.isfinite(agent.predict(broken)[0]).all()

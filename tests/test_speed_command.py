@@ -33,7 +33,7 @@ from experiments.speed.measure import (
     interleave,
 )
 
-MEASURED = ["single", "vector", "solvers", "batches", "tuning"]
+MEASURED = ["single", "vector", "solvers", "batches", "tuning", "rendering"]
 
 
 def quietly(text: str) -> None:

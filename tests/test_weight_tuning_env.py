@@ -121,7 +121,7 @@ def test_arguments_are_those_of_the_tracking_environment_and_documented() -> Non
         inspect.signature(kind).parameters for kind in (WeightTuningEnv, WeightTuningVectorEnv)
     )
     own = {"choice", "delay_compensation"}
-    assert set(single) == set(tracking) - {"reward_weights", "plant"} | own
+    assert set(single) == set(tracking) - {"reward_weights", "plant", "render_colour"} | own
     assert set(vector) == set(single) | {"num_envs", "autoreset_mode", "threads"}
     for name in set(single) - own - {"conditions"}:
         assert single[name].default == vector[name].default == tracking[name].default

@@ -231,11 +231,19 @@ def test_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.render()
     env.reset(seed=0)
+    assert env.render() is not None
     env.step(np.zeros((2, 3)))
     frames = env.render()
     assert frames is not None
     assert [frame.shape for frame in frames] == [(600, 900, 3)] * 2
     assert not np.array_equal(*frames)
+    # The weights in use stand on a card of their own, without which all else stays.
+    plain = env.drives.render()
+    assert plain is not None
+    rows, columns = np.nonzero((plain[0] != frames[0]).any(axis=2))
+    assert len(rows) > 500
+    assert columns.max() < 250
+    assert rows.max() < 300
     env.close()
     with pytest.raises(ValueError, match="render_mode"):
         make(2, render_mode="human")

@@ -97,9 +97,10 @@ class SolvedNmpc(NmpcAgent[NmpcMemory]):
         )
 
     def diagnostics(self, memory: NmpcMemory) -> dict[str, Any]:
-        """Last solve of one vehicle: status, seconds, iterations, cost, slack (3,), plan.
+        """Last solve of one vehicle: status, seconds, iterations, cost, slack (3,), plan, weights.
 
-        `plan` (N + 1, 2) holds the predicted positions in the frame of the path's foot point.
+        `weights` (10,) are Q, S, R in use. `plan` (N + 1, 2) holds the predicted positions in the
+        frame of the path's foot point.
         """
         solution = memory.solution
         if solution is None:
@@ -112,6 +113,7 @@ class SolvedNmpc(NmpcAgent[NmpcMemory]):
             "slack": None if solution.slack is None else solution.slack.max(axis=0),
             "fallback": memory.ladder.fallback,
             "plan": None if solution.states is None else solution.states[:, 4:],
+            "weights": memory.weights[0].copy(),
         }
 
 

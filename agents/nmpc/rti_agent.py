@@ -250,11 +250,11 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             rti.bound_action(a, delta, self.solver.constants, memory.actions[row])
 
     def diagnostics(self, memory: RtiRow) -> dict[str, Any]:
-        """Last solve of one vehicle: status, seconds, iterations, cost, slack (3,), plan.
+        """Last solve of one vehicle: status, seconds, iterations, cost, slack (3,), plan, weights.
 
-        `plan` (N + 1, 2) holds the predicted positions in the frame of the path's foot point;
-        `iterations` are those of the interior-point method; `seconds` those of the whole batch,
-        shared out evenly.
+        `weights` (10,) are Q, S, R in use. `plan` (N + 1, 2) holds the predicted positions in the
+        frame of the path's foot point; `iterations` are those of the interior-point method;
+        `seconds` those of the whole batch, shared out evenly.
         """
         batch, row = memory.memory, memory.row
         told = batch.told[row]
@@ -270,4 +270,5 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             "slack": told[program.SLACK : program.SLACK + 3][order] if solved else None,
             "fallback": "" if solved or ladder is None else ladder.fallback,
             "plan": batch.states[row, :, 4:].copy() if solved else None,
+            "weights": (batch.weights[row] if self.has_schedule else self.fixed_weights[0]).copy(),
         }

@@ -16,6 +16,7 @@ from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.score import FAILED, failed, marginal_parts, parts_of, scores_of
 from agents.weight_tuning.spaces import action_space, checked_choices, observation_space
+from agents.weights import in_words
 from lpv_track_env import kernels as k
 from lpv_track_env.conditions import Conditions
 from lpv_track_env.vector_checks import checked_mask, checked_mode
@@ -238,8 +239,11 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         }  # fmt: skip
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Draw every environment, as `PathTrackingVectorEnv` does."""
-        return self.drives.render()
+        """Draw every environment, as `PathTrackingVectorEnv` does, and the weights in use."""
+        # Of zeros before the first window of an episode.
+        return self.drives.render(
+            [in_words(row) if row.any() else {} for row in self.loop.memory.nmpc.weights]
+        )
 
     def close_extras(self, **_: Any) -> None:
         """Free what drawing took."""

@@ -29,6 +29,7 @@ from experiments.speed import (
     loops,
     policies,
     processes,
+    rendering,
     solvers,
     tables,
     wild,
@@ -54,6 +55,7 @@ SECTIONS: dict[str, tuple[str, Measure]] = {
     "wild": ("The real-time NMPC on wild observations", wild.wild),
     "loops": ("Closed loops in compiled code", loops.loops),
     "tuning": ("Decisions on the NMPC's weights", loops.tuning),
+    "rendering": ("Frames of a drive, headless", rendering.rendering),
     "memory": ("Memory of fresh processes", processes.memory),
     "startup": ("Start-up of fresh processes", processes.startup),
 }

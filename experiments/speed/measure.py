@@ -53,6 +53,8 @@ class Effort:
     batches: tuple[int, ...] = (1, 4, 16, 64, 256, 1024)
     wild: int = 6000
     """Wild observations for each vehicle."""
+    frames: int = 5000
+    """Frames of a drive that are drawn at most."""
     processes: int = 3
     """Fresh processes of a kind."""
     cold: bool = True
@@ -65,7 +67,7 @@ FULL = Effort()
 QUICK = Effort(
     rounds=3, round_seconds=0.005, sizes=(1, 16), learning_rounds=1, learning_steps=128,
     trajectories=("T2",), window=6, windows=2, repeats=1, horizons=(10, 20), batches=(1, 4),
-    wild=60, processes=1, cold=False, large=64,
+    wild=60, frames=40, processes=1, cold=False, large=64,
 )  # fmt: skip
 
 

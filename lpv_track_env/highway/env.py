@@ -207,6 +207,21 @@ class HighwayTrackEnv(PathTrackingEnv):
         self.highway.controlled_vehicles = [self._ego]
         self.highway.define_spaces()
         self._place()
+        self._draw_others()
+
+    def _begin_drawing(self) -> None:
+        """Tell the renderer, if there is one, of a new episode: its road and traffic."""
+        if self._renderer is not None:
+            from lpv_track_env.highway.drawing import scenery
+
+            self._renderer.begin(self.task, scenery(self.highway.road.network))
+            self._draw_others()
+
+    def _draw_others(self) -> None:
+        if self._renderer is not None:
+            from lpv_track_env.highway.drawing import boxes
+
+            self._renderer.others = boxes(self.others)
 
     def _place(self) -> None:
         assert self._ego is not None
@@ -229,6 +244,7 @@ class HighwayTrackEnv(PathTrackingEnv):
             # What the plant would refuse must not move the traffic.
             check_action(action)
             scenes.move(self.highway.road, self.control_period)
+            self._draw_others()
         tracking, reward, terminated, truncated, info = super().step(action)
         self._place()
         scenes.collide(self.highway.road, self.control_period)
