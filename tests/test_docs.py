@@ -59,7 +59,7 @@ def run_page(page: Path, names: dict[str, Any] | None = None) -> dict[str, Any]:
         if language == "python":
             exec(compile(shorter(text), page.name, "exec"), names)  # noqa: S102  our own text
         elif language == "sh" and page.name == "tutorial.md":
-            for line in text.splitlines():
+            for line in text.replace("\\\n", " ").splitlines():
                 if not line.startswith(INSTALL):
                     words = shlex.split(shorter(line), comments=True)
                     assert cli.main(words[1:]) == 0, line
@@ -120,7 +120,9 @@ def test_policies_of_the_page_are_trained_written_and_driven(
 def commands(page: Path) -> list[str]:
     """Command lines in a page's blocks, indented lines and inline code."""
     text = page.read_text()
-    code = [block for language, _, block in blocks(page) if language in {"sh", ""}]
+    code = [
+        block.replace("\\\n", " ") for language, _, block in blocks(page) if language in {"sh", ""}
+    ]
     rest = FENCE.sub("", text)
     code += [line for line in rest.splitlines() if line.startswith("    lpv-track")]
     code += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", rest)]
