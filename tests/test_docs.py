@@ -72,7 +72,7 @@ def has_python(page: Path) -> bool:
 
 PYTHON_PAGES = [
     page for page in PAGES
-    if has_python(page) and page.name not in {"tutorial.md", "learning.md", "CONTRIBUTING.md"}
+    if has_python(page) and page.name not in {"tutorial.md", "learning.md"}
 ]  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 SHORT = {
-    "compare_agents": ["--seeds", "2", "--agents", "lpv-nmpc", "stanley"],
+    "compare_agents": ["--seeds", "2", "--agents", "lpv-nmpc", "stanley", "--workers", "1"],
     "train_ppo": ["--steps", "4096", "--envs", "64"],
     "tune_weights": ["--candidates", "4", "--drives", "4", "--seconds", "4"],
     "parallel_vector_env": ["--envs", "64", "--steps", "100"],

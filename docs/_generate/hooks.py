@@ -32,6 +32,7 @@ ERRATUM = re.compile(r"<!-- erratum (\d+) -->")
 FORMULA = re.compile(r"^\$\$\n(.*?)\n\$\$$", re.DOTALL | re.MULTILINE)
 FORMULA_SIZE = 17
 """px."""
+FETCHED = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
 COMMANDS = "<!-- commands -->"
 FROM_ROOT = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 
@@ -54,6 +55,13 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
         return ERRATUM.sub(lambda match: ERRATA[int(match[1]) - 1], markdown)
     markdown = FORMULA.sub(lambda match: drawn(match[1]), markdown)
     return markdown.replace(COMMANDS, command_reference(parser()))
+
+
+def on_post_page(output: str, page: Page, **_: Any) -> str:
+    """Refuse a page that a browser would fetch something for from another server."""
+    if found := FETCHED.search(output):
+        raise PluginError(f"{page.file.dest_uri} asks another server for {found[0]}")
+    return output
 
 
 def drawn(formula: str) -> str:
