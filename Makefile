@@ -6,12 +6,13 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup setup-dev benchmark test lint clean
+.PHONY: help setup setup-dev setup-docs benchmark test lint docs clean
 help:
 	@echo "make benchmark   drive the paper's six trajectories, print the table, write results/benchmark/report.html"
 	@echo "make test        run the tests"
 	@echo "make lint        ruff, mypy and the import-direction contract"
-	@echo "make setup       the set-up of 'make benchmark' alone (setup-dev: that of test and lint)"
+	@echo "make docs        the site, into build/site: open build/site/index.html"
+	@echo "make setup       the set-up of 'make benchmark' alone (setup-dev: that of test and lint; setup-docs)"
 
 $(BIN)/python:
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found: install Python 3.11 or newer, or say make PYTHON=/path/to/python"; exit 2; }
@@ -26,8 +27,13 @@ $(VENV)/setup-dev.stamp: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install --editable ".[test,dev]" --constraint constraints.txt
 	@touch $@ $(VENV)/setup.stamp
 
+$(VENV)/setup-docs.stamp: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) install --editable ".[docs]" --constraint constraints.txt
+	@touch $@ $(VENV)/setup.stamp
+
 setup: $(VENV)/setup.stamp
 setup-dev: $(VENV)/setup-dev.stamp
+setup-docs: $(VENV)/setup-docs.stamp
 
 benchmark: setup
 	$(BIN)/lpv-track benchmark --suite paper --out results/benchmark --resume
@@ -39,7 +45,13 @@ lint: setup-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy examples docs/_generate
 	$(BIN)/lint-imports
+
+# Material for MkDocs prints an announcement of its successor unless it is told not to.
+docs: export NO_MKDOCS_2_WARNING = 1
+docs: setup-docs
+	$(BIN)/mkdocs build --strict
 
 clean:
 	rm -rf $(VENV) build results .mypy_cache .ruff_cache .pytest_cache

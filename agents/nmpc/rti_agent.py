@@ -85,6 +85,9 @@ class RtiRow:
 class RtiNmpc(NmpcAgent[RtiRow]):
     """The LPV-NMPC of kumar2025lpv by real-time iterations: microseconds a solve.
 
+    The public behaviour is that of `lpv-nmpc-ipopt`, its ladder after failed solves included. A
+    batch of observations (n, size) is solved in one compiled call.
+
     Parameters
     ----------
     task
@@ -108,9 +111,6 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         Failed solves in a row after which the vehicle is brought to a stop.
     threads
         Threads that share a batch of observations, 1 by default. Results do not depend on it.
-
-    The public behaviour is that of `lpv-nmpc-ipopt`, its ladder after failed solves included. A
-    batch of observations (n, size) is solved in one compiled call.
 
     Raises
     ------
