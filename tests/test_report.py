@@ -5,11 +5,11 @@ import re
 
 import numpy as np
 import pytest
+from experiments.report_page import ERRATA
 from made_results import HOSTILE, Outline, case, folder_of, page, printed, trace
 
 from experiments import figures, published, tables
 from experiments.report import write_report
-from experiments.report_page import ERRATA
 from experiments.results import ResultStore
 from lpv_track_env import vehicle
 from trajectories import load
