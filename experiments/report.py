@@ -71,7 +71,7 @@ def build(cases: Sequence[Result], store: ResultStore) -> str:
         subtitle=subtitle(manifest),
         contents=document.contents,
         body=document.body,
-        scripts=(replay.SCRIPT,),
+        scripts=(replay.SCRIPT,) if drives else (),
     )
 
 

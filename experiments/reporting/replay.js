@@ -7,6 +7,7 @@
   const data = JSON.parse(store.textContent);
   const calm = matchMedia("(prefers-reduced-motion: reduce)");
   const VIEW_METRES = 50; // of the shorter side, following the vehicle
+  const LEAD = "lpv-nmpc";
   const CALM_STEP = 0.5; // s between pictures where motion is not wanted
   const STRIPS = [
     ["lateral", "lateral error", "m", 3],
@@ -74,8 +75,16 @@
     return element;
   };
   const labelled = (words, element) => make("label", {}, words, element);
-  const options = (select, pairs) => {
-    select.replaceChildren(...pairs.map(([key, words]) => make("option", { value: key }, words)));
+  const options = (pairs) =>
+    pairs.map(([key, words]) => make("option", { value: key }, String(words)));
+  // Drives in groups of one family each; what tells them apart comes first, for narrow screens.
+  const words = (drive) => `${drive.agent}, ${drive.conditions}, seed ${drive.seed}`;
+  const identity = (drive) => JSON.stringify([words(drive), drive.family]);
+  const grouped = (numbers) => {
+    const families = Map.groupBy(numbers, (k) => data.runs[k].family);
+    return [...families].map(([family, members]) =>
+      make("optgroup", { label: family },
+        ...options(members.map((k) => [k, words(data.runs[k])]))));
   };
   const pathSelect = make("select", { id: "replay-path" });
   const firstSelect = make("select", { id: "replay-first" });
@@ -95,7 +104,7 @@
     make("div", { class: "choose" }, labelled("path", pathSelect),
       labelled("first drive", firstSelect), labelled("second drive", secondSelect)),
     plan,
-    make("div", { class: "control" }, playButton, slider, clock, labelled("speed", rateSelect),
+    make("div", { class: "control" }, playButton, slider, clock, labelled("rate", rateSelect),
       viewButton),
     make("div", { class: "strips" }, ...strips),
     make("div", { class: "wide readout", tabindex: "0" }, readout),
@@ -228,7 +237,7 @@
     pen.stroke();
     pen.fillText(`${metres} m`, 12, height - 18);
   };
-  const drawStrip = (canvas, [name, words, unit, digits]) => {
+  const drawStrip = (canvas, [name, title, unit, digits]) => {
     const [pen, width, height] = prepared(canvas);
     const [top, floor] = [18, height - 6];
     const every = state.drives.map((drive) => drive[name]);
@@ -241,7 +250,7 @@
     pen.lineWidth = 1;
     polyline(pen, 2, (k) => [k * width, down(0)]);
     pen.fillStyle = colours.soft;
-    pen.fillText(`${words} (${unit}): ${digitsOf(low, digits)} to ${digitsOf(high, digits)}`, 2, 11);
+    pen.fillText(`${title} (${unit}): ${digitsOf(low, digits)} to ${digitsOf(high, digits)}`, 2, 11);
     state.drives.forEach((drive, k) => {
       const step = drive.duration / (drive.count - 1);
       if (name === "yaw" && k === 0) {
@@ -338,21 +347,25 @@
     state.drives = [run(Number(firstSelect.value)), run(second)].filter(Boolean);
     state.end = Math.max(...state.drives.map((drive) => drive.duration));
     slider.max = String(state.end);
-    slider.step = String(state.end / 1000);
+    // About a tenth of a second, and the last step ends exactly where the drive does.
+    slider.step = String(state.end / Math.max(Math.round(10 * state.end), 1));
     layTable();
     goTo(state.time);
   };
   const takePath = () => {
-    const own = data.runs.flatMap((one, k) => (one.path === pathSelect.value ? [[k, one.name]] : []));
-    const before = [firstSelect, secondSelect].map((select) => select.selectedOptions[0]?.text);
-    options(firstSelect, own);
-    options(secondSelect, [["", "none"], ...own]);
-    const kept = before.map((name) => own.find(([, words]) => words === name)?.[0]);
+    const own = [...data.runs.keys()].filter((k) => data.runs[k].path === pathSelect.value);
+    const alone = secondSelect.value === "" && state.drives.length === 1;
+    const before = state.drives.map(identity);
+    firstSelect.replaceChildren(...grouped(own));
+    secondSelect.replaceChildren(...options([["", "none"]]), ...grouped(own));
+    // The same agents go on with the next path; at first the leading one under two conditions.
+    const kept = before.map((name) => own.find((k) => identity(data.runs[k]) === name));
     const agent = (k) => data.runs[k].agent;
-    const lead = kept[0] ?? (own.find(([k]) => agent(k) === "lpv-nmpc") ?? own[0])[0];
-    const rival = own.find(([k]) => k !== lead && agent(k) === agent(lead)) ?? own.find(([k]) => k !== lead);
+    const lead = kept[0] ?? own.find((k) => agent(k) === LEAD) ?? own[0];
+    const others = own.filter((k) => k !== lead);
+    const rival = others.find((k) => agent(k) === agent(lead)) ?? others[0];
     firstSelect.value = String(lead);
-    secondSelect.value = before[1] === "none" ? "" : String(kept[1] ?? rival?.[0] ?? "");
+    secondSelect.value = alone ? "" : String(kept[1] ?? rival ?? "");
     state.time = 0;
     takeDrives();
   };
@@ -361,8 +374,8 @@
     viewButton.setAttribute("aria-pressed", String(on));
     redraw();
   };
-  options(pathSelect, Object.keys(data.paths).map((name) => [name, name]));
-  options(rateSelect, [1, 2, 5, 10, 20].map((rate) => [rate, `×${rate}`]));
+  pathSelect.append(...options(Object.keys(data.paths).map((name) => [name, name])));
+  rateSelect.append(...options([1, 2, 5, 10, 20].map((rate) => [rate, `×${rate}`])));
   rateSelect.value = "5";
   pathSelect.addEventListener("change", takePath);
   firstSelect.addEventListener("change", takeDrives);

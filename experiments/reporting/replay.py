@@ -16,6 +16,7 @@ from experiments.reporting.drives import (
     by_setting,
     by_trajectory,
     families,
+    family_of,
     plant,
     reference_line,
 )
@@ -70,7 +71,8 @@ def moments(drive: Drive) -> dict[str, Any]:
         "path": drive.trajectory,
         "agent": drive.label,
         "conditions": drive.conditions,
-        "name": f"{drive.label} · {tables.setting_of(case)} · seed {case.get('seed')}",
+        "seed": case.get("seed"),
+        "family": family_of(case),
         "end": str(case.get("end") or "?").replace("_", " "),
         "duration": float(time[-1] - time[0]),
         "count": count,

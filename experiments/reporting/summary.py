@@ -17,7 +17,7 @@ HEADINGS = (
     "agent", "whole path", "mean ALE, m", "worst MLE, m", "mean AOE, rad",
     "ALE against published", "median predict, ms", "worst p99, ms", "all constraints kept",
 )  # fmt: skip
-CAPTION = (
+NOTE = (
     "ALE, AOE: root mean square lateral and heading error, MLE: largest lateral error; over all "
     "runs that did not fail, with the 95 % interval over seeds where there are several. An episode "
     "that ended early counts for the part it drove. “Against published”: mean over T1 to T6 of "
@@ -43,12 +43,13 @@ def summary_section(document: Document, cases: Sequence[Result], superseded: int
         (
             family_of(group[0]) == family,
             document.table(
-                f"Key figures of every agent, {setting}. {CAPTION}",
+                f"Key figures of every agent, {setting}.",
                 html_table(HEADINGS, _key_lines(group), range(1, len(HEADINGS))),
             ),
         )
         for setting, group in tables.cases_by_setting(cases).items()
     ]
+    parts.append(paragraph(NOTE, "soft"))
     parts.append(first_open(shown, "Other settings"))
     return joined(parts)
 
