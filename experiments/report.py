@@ -45,6 +45,11 @@ def write_report(folder: Path) -> Path:
     return file
 
 
+def where(report: Path) -> str:
+    """A line for a terminal: where the report is, and how large."""
+    return f"report: {report} ({report.stat().st_size / 1e6:.1f} MB)"
+
+
 def build(cases: Sequence[Result], store: ResultStore) -> str:
     """The page as text."""
     kept = in_families(tables.ordered(tables.current(cases)))
@@ -54,7 +59,7 @@ def build(cases: Sequence[Result], store: ResultStore) -> str:
     document = Document()
     document.section("Summary", summary_section(document, kept, len(cases) - len(kept)))
     figure_sections(document, drives, missing, styles)
-    document.section("Replay", replay.replay_section(drives))
+    document.section("Replay", replay.replay_section(drives), printed=False)
     document.section("Against the published table", comparison_section(document, kept))
     document.section("By curvature", curvature_section(document, kept, styles))
     document.section("Computing time", computing_section(document, drives, styles))

@@ -5,14 +5,14 @@ import re
 
 import numpy as np
 import pytest
-from experiments.reporting import charts, sideslip
-from experiments.reporting.drives import reference_path, usable
-from experiments.reporting.errata import ERRATA
-from experiments.reporting.styles import line_styles
 from made_results import HOSTILE, Outline, case, folder_of, own_scripts_alone, page, printed, trace
 
 from experiments import published, tables
 from experiments.report import write_report
+from experiments.reporting import charts, sideslip
+from experiments.reporting.drives import reference_path, usable
+from experiments.reporting.errata import ERRATA
+from experiments.reporting.styles import line_styles
 from experiments.results import ResultStore
 from lpv_track_env import vehicle
 from trajectories import load

@@ -23,7 +23,8 @@ class Document:
 
     figures: int = 0
     tables: int = 0
-    sections: list[tuple[str, str]] = field(default_factory=list)
+    sections: list[tuple[str, str, str]] = field(default_factory=list)
+    """Title, content and attributes of each."""
 
     def figure(
         self, caption: str, panels: Sequence[Panel], legend: str = "", wide: bool = False
@@ -67,26 +68,26 @@ class Document:
         head = _caption(f"Table {self.tables}", place, caption)
         return f'<figure class="tabular" id="{place}">{head}\n{box}</figure>'
 
-    def section(self, title: str, content: str) -> None:
-        """Add a section, unless it is empty."""
+    def section(self, title: str, content: str, *, printed: bool = True) -> None:
+        """Add a section, unless it is empty; one that is not printed is for screens alone."""
         if content:
-            self.sections.append((title, content))
+            self.sections.append((title, content, "" if printed else ' class="screen"'))
 
     @property
     def contents(self) -> str:
         """Links to the sections."""
         return "".join(
             f'<a href="#s{number}">{html.escape(title)}</a>'
-            for number, (title, _) in enumerate(self.sections, start=1)
+            for number, (title, _, _) in enumerate(self.sections, start=1)
         )
 
     @property
     def body(self) -> str:
         """All sections."""
         return "\n".join(
-            f'<section id="s{number}"><h2><span class="number">{number}</span> '
+            f'<section id="s{number}"{kind}><h2><span class="number">{number}</span> '
             f"{html.escape(title)}</h2>\n{content}\n</section>"
-            for number, (title, content) in enumerate(self.sections, start=1)
+            for number, (title, content, kind) in enumerate(self.sections, start=1)
         )
 
 

@@ -9,6 +9,9 @@ from experiments.reporting.errata import ERRATA
 from experiments.reporting.html_tables import html_table
 from experiments.tables import Result
 
+LONG = 24
+"""Most entries of a list that are told."""
+
 
 def errata_section() -> str:
     """Readings that matter when our numbers are held against the paper's."""
@@ -47,5 +50,7 @@ def _flat(value: Any, name: str = "") -> list[tuple[str, str]]:
             for leaf in _flat(value[key], f"{name}.{key}" if name else str(key))
         ]
     if isinstance(value, list):
-        return [(name, ", ".join(map(str, value)))]
+        words = ", ".join(map(str, value[:LONG]))
+        more = f" … ({len(value)} in manifest.json)" if len(value) > LONG else ""
+        return [(name, words + more)]
     return [(name, str(value))]

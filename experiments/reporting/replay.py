@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments import tables
 from experiments.reporting.charts import spread
 from experiments.reporting.document import joined, paragraph
 from experiments.reporting.drives import (
