@@ -46,9 +46,17 @@ class Scale:
         decades = [10.0**k for k in range(first, last + 1, every)]
         if len(decades) >= 2:
             return decades
-        fine = [factor * 10.0**k for k in range(first - 1, last + 1) for factor in (1.0, 2.0, 5.0)]
-        fine = [value for value in fine if self.low <= value <= self.high]
-        return fine if len(fine) >= 2 else Scale(self.low, self.high).ticks(count)
+        fine: list[float] = []
+        for factors in ((1.0, 2.0, 5.0), (1.0, 2.0, 3.0, 5.0, 7.0)):
+            fine = [
+                value
+                for k in range(first - 1, last + 1)
+                for factor in factors
+                if self.low <= (value := factor * 10.0**k) <= self.high
+            ]
+            if len(fine) > 2:
+                return fine
+        return fine if len(fine) > 1 else Scale(self.low, self.high).ticks(count)
 
     @staticmethod
     def words(value: float) -> str:
