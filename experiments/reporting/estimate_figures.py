@@ -39,6 +39,18 @@ def ends(value: Estimate) -> tuple[float, float]:
     return value.mean - width, value.mean + width
 
 
+def upright(chart: Chart, x: float, interval: tuple[float, float, float], style: LineStyle) -> None:
+    """A mark at the middle of (low, middle, high) of the y axis, a line from end to end.
+
+    Hollow where the style's lines are dashed: colours come twice.
+    """
+    low, middle, high = interval
+    if high > low:
+        chart.segment((x, x), (low, high), f"c{style.colour} mark")
+    kind = f"hollow c{style.colour}" if style.dashes else f"f{style.colour}"
+    chart.dot(x, middle, kind, 2.6)
+
+
 def by_agent(
     measured: Sequence[Measured], styles: Mapping[str, LineStyle], words: str, key: str
 ) -> list[Panel]:
@@ -105,10 +117,6 @@ def by_band(lines: Mapping[str, Sequence[Line]], styles: Styles) -> list[Panel]:
                 if cell is None:
                     continue
                 low, high = (max(end, FLOOR) for end in ends(cell.ale))
-                place = band + offset
-                if high > low:
-                    chart.segment((place, place), (low, high), f"c{style.colour} mark")
-                hollow = f"hollow c{style.colour}" if style.dashes else f"f{style.colour}"
-                chart.dot(place, max(cell.ale.mean, FLOOR), hollow, 2.6)
+                upright(chart, band + offset, (low, max(cell.ale.mean, FLOOR), high), style)
         panels.append(Panel(title, chart.svg()))
     return panels

@@ -10,6 +10,7 @@ from agents.weight_tuning.files import load
 from agents.weights import TrackingWeights
 from experiments.band_metrics import BANDS
 from experiments.reporting.charts import Chart
+from experiments.reporting.estimate_figures import upright
 from experiments.reporting.path_figures import Panel
 from experiments.reporting.scales import Scale, around, decades
 from experiments.reporting.styles import Styles
@@ -28,14 +29,6 @@ GROUPS = {"speed": (0, 4), "heading": (1, 5), "position": (2, 3, 6, 7)}
 """Indices of Q and S by what they weigh."""
 WINDOWS = 40
 HEIGHT = 230.0
-
-
-def _mark(chart: Chart, x: float, interval: tuple[float, float, float], kind: int) -> None:
-    """A disc at the middle of (low, middle, high) of a y axis, a line from end to end."""
-    low, middle, high = interval
-    if high > low:
-        chart.segment((x, x), (low, high), f"c{kind} mark")
-    chart.dot(x, middle, f"f{kind}", 2.6)
 
 
 def learning_curves(study: Study, styles: Styles) -> list[Panel]:
@@ -81,7 +74,7 @@ def regret(rows: Sequence[Judged], greedy: float, styles: Styles) -> list[Panel]
             continue
         # Side by side, where budgets are the same.
         place = row.solves * 1.08 ** (k - 0.5 * len(rows))
-        _mark(chart, place, (row.score.low - greedy, value, row.score.high - greedy), style.colour)
+        upright(chart, place, (row.score.low - greedy, value, row.score.high - greedy), style)
     return [Panel("95 % intervals", chart.svg())]
 
 
@@ -96,7 +89,7 @@ def gains_in_bands(every: Mapping[str, Mapping[str, Interval]], styles: Styles) 
         for band, gain in gains.items():
             interval = 100 * gain.low, 100 * gain.value, 100 * gain.high
             place = BANDS.names.index(band) + _offset(k, len(every))
-            _mark(chart, place, interval, styles[label].colour)
+            upright(chart, place, interval, styles[label])
     return [Panel("95 % intervals", chart.svg())]
 
 
@@ -150,13 +143,13 @@ def weights_over_curvature(
                 if own.size:
                     low, middle, high = (float(one) for one in np.quantile(own, [0.25, 0.5, 0.75]))
                     place = band + _offset(k, len(found))
-                    marks.append((place, (low, middle, high), styles[label].colour))
+                    marks.append((place, (low, middle, high), styles[label]))
         chart = _bands_chart(
             around([[0.0], *(interval for _, interval, _ in marks)], least=0.1),
             "lg factor on default Q, S",
         )
         chart.rule(y=0.0, kind="zero")
-        for place, interval, colour in marks:
-            _mark(chart, place, interval, colour)
+        for place, interval, style in marks:
+            upright(chart, place, interval, style)
         panels.append(Panel(group, chart.svg()))
     return panels

@@ -106,9 +106,9 @@ def _ladder(page: Document, name: str, rows: list[tables.Judged], gain: float | 
         [
             page.table(
                 f"The ladder on {name}. Interquartile means over trainings; intervals by bootstrap "
-                "over trainings and paths, 10,000 resamples. Gains are paired: the same drives, "
-                "training against training. “At most” is the 95 % Clopper-Pearson bound on the "
-                "rate of failures.",
+                "over trainings and paths, 10,000 resamples. Gains are those over the best fixed "
+                "set, paired: the same drives, training against training. “At most” is the 95 % "
+                "Clopper-Pearson bound on the rate of failures.",
                 html_table(
                     [one for k, one in enumerate(headings) if k != prose],
                     [[one for k, one in enumerate(line) if k != prose] for line in lines],
