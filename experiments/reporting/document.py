@@ -46,7 +46,7 @@ class Document:
         place = f"figure-{self.figures}"
         name = caption.split(". ", 1)[0].rstrip(".")
         parts = "\n".join(
-            f'<div class="panel"><h5>{html.escape(panel.title)}</h5>'
+            f'<div class="panel"><p class="title">{html.escape(panel.title)}</p>'
             f'<div role="img" aria-label="{html.escape(f"{name}: {panel.title}")}">{panel.svg}'
             "</div></div>"
             for panel in panels
