@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from browsers import DESK, PHONE, chromium, pixels, prefer, show
-from made_results import HOSTILE, case, trace
+from made_results import HOSTILE, case, folder_of, trace
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
@@ -27,6 +27,13 @@ return outside;
 """What is wider than the screen though it does not scroll within its own box."""
 
 
+def overflow(browser):
+    """By how many px all of an opened page is wider than the screen, and what sticks out."""
+    browser.execute_script("document.querySelectorAll('details').forEach((one) => one.open = true)")
+    measure = "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
+    return browser.execute_script(measure), browser.execute_script(HIDDEN_OVERFLOW)
+
+
 @pytest.fixture(name="page", scope="module")
 def fixture_page(tmp_path_factory):
     """Two agents on two paths, in simulation and with two seeds in real time, and odd names."""
@@ -41,7 +48,7 @@ def fixture_page(tmp_path_factory):
                     number, agent, path, {"ale": 0.01 * number, "ale_sharp": 0.02 * number,
                     "share_sharp": 1.0}, conditions=conditions, seed=seed,
                 )  # fmt: skip
-                store.append({**result, "trace": trace(n=201 + 40 * number, noise=0.01)})
+                store.append({**result, "trace": trace(n=1201 + 40 * number, noise=0.01)})
     wide = {"excess_lateral_velocity": 0.4, "violated_lateral_velocity": 1.0}
     odd = case(90, HOSTILE, "a-rather-long-name-of-a-path.csv", wide, warnings=[HOSTILE * 3])
     store.append({**odd, "trace": trace(n=50)})
@@ -69,10 +76,18 @@ def test_it_opens_without_complaint_fetches_nothing_and_fits_the_screen(browser,
         if one["method"] == "Network.requestWillBeSent"
     ]
     assert asked == [page.as_uri()]
-    browser.execute_script("document.querySelectorAll('details').forEach((one) => one.open = true)")
-    measure = "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
-    assert browser.execute_script(measure) == 0
-    assert browser.execute_script(HIDDEN_OVERFLOW) == []
+    assert overflow(browser) == (0, [])
+
+
+@pytest.mark.parametrize("width", [PHONE, 500, 768])
+def test_figures_of_one_path_fit_beside_or_below_each_other(browser, tmp_path, width):
+    folder_of(tmp_path, [case(1, "lpv-nmpc"), case(2)])
+    show(browser, write_report(tmp_path), width)
+    assert overflow(browser) == (0, [])
+    tops = browser.execute_script(
+        "return [...document.querySelectorAll('.plate.lone')].map((one) => one.offsetTop)"
+    )
+    assert (tops[0] == tops[1]) == (width > 700)
 
 
 def test_its_policy_stops_what_is_not_its_own(browser, page):
@@ -172,22 +187,22 @@ def test_the_replay_is_scrubbed_by_slider_keys_and_charts(browser, page, width):
     show(browser, page, width)
     slider = browser.find_element(By.ID, "replay-time")
     clock = browser.find_element(By.ID, "replay-clock")
-    # Both drives of the leading agent: 240 and 280 periods of 0.05 s.
-    WebDriverWait(browser, 5).until(lambda _: clock.text == "0.0 of 14.0 s")
+    # Both drives of the leading agent: 1240 and 1280 periods of 0.05 s.
+    WebDriverWait(browser, 5).until(lambda _: clock.text == "0.0 of 64.0 s")
     before = [pixels(browser, f"#replay-{name}") for name in ("view", "lateral", "speed")]
     assert len(set(before)) == 3
     slider.send_keys(Keys.END)
-    WebDriverWait(browser, 5).until(lambda _: clock.text == "14.0 of 14.0 s")
+    WebDriverWait(browser, 5).until(lambda _: clock.text == "64.0 of 64.0 s")
     after = [pixels(browser, f"#replay-{name}") for name in ("view", "lateral", "speed")]
     assert all(one != other for one, other in zip(before, after, strict=True))
-    assert slider.get_attribute("aria-valuetext") == "14.0 of 14.0 s"
+    assert slider.get_attribute("aria-valuetext") == "64.0 of 64.0 s"
     slider.send_keys(Keys.ARROW_LEFT)
-    WebDriverWait(browser, 5).until(lambda _: clock.text != "14.0 of 14.0 s")
+    WebDriverWait(browser, 5).until(lambda _: clock.text != "64.0 of 64.0 s")
     chart = browser.find_element(By.ID, "replay-heading")
     browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", chart)
     chart.click()
     WebDriverWait(browser, 5).until(
-        lambda _: clock.text in {"6.9 of 14.0 s", "7.0 of 14.0 s", "7.1 of 14.0 s"}
+        lambda _: clock.text.startswith(("31.8", "31.9", "32.0", "32.1", "32.2"))
     )
     assert "T1 from above at" in browser.find_element(By.ID, "replay-view").accessible_name
 
@@ -199,9 +214,9 @@ def test_the_replay_says_what_was_driven(browser, page):
     slider = browser.find_element(By.ID, "replay-time")
     slider.send_keys(Keys.END)
     clock = browser.find_element(By.ID, "replay-clock")
-    WebDriverWait(browser, 5).until(lambda _: clock.text == "12.0 of 12.0 s")
+    WebDriverWait(browser, 5).until(lambda _: clock.text == "62.0 of 62.0 s")
     cells = browser.find_elements(By.CSS_SELECTOR, ".readout tbody td")
-    made = trace(n=241, noise=0.01)
+    made = trace(n=1241, noise=0.01)
     shown = [float(cell.text.replace("−", "-")) for cell in cells[:6]]
     wanted = [
         made["lateral_error"][-1], made["heading_error"][-1], made["state"][-1, 2],
@@ -212,6 +227,8 @@ def test_the_replay_says_what_was_driven(browser, page):
 
 def test_the_replay_plays_pauses_and_shows_other_drives(browser, page):
     show(browser, page)
+    # Long enough at this rate that it does not end by itself on a slow machine.
+    Select(browser.find_element(By.ID, "replay-rate")).select_by_visible_text("×1")
     play = browser.find_element(By.ID, "replay-play")
     clock = browser.find_element(By.ID, "replay-clock")
     play.click()
@@ -241,10 +258,10 @@ def test_the_replay_moves_in_steps_where_motion_is_not_wanted(browser, page):
     times = browser.execute_async_script(
         "const done = arguments[0], seen = new Set(), began = performance.now();"
         "const look = () => { seen.add(document.getElementById('replay-clock').textContent);"
-        "  if (performance.now() - began > 1200) done([...seen]); else requestAnimationFrame(look);"
+        "  if (performance.now() - began > 2200) done([...seen]); else requestAnimationFrame(look);"
         "}; look();"
     )
-    assert 2 <= len(times) <= 4
+    assert 2 <= len(times) <= 6
     prefer(browser, prefers_reduced_motion="no-preference")
 
 

@@ -52,8 +52,11 @@ class Document:
             for panel in panels
         )
         kind = "panels few" if wide else "panels"
+        # Figures of one panel stand beside each other.
+        plate = "plate" if wide or len(panels) > 1 else "plate lone"
         return (
-            f'<figure class="plate" id="{place}">{legend}\n<div class="{kind}">\n{parts}\n</div>\n'
+            f'<figure class="{plate}" id="{place}">{legend}\n'
+            f'<div class="{kind}">\n{parts}\n</div>\n'
             f"{_caption(f'Figure {self.figures}', place, caption)}</figure>"
         )
 
