@@ -21,7 +21,7 @@ from experiments import engines
 from experiments.cases import Case
 from experiments.console_tables import console_table
 from experiments.interrupts import Interrupts
-from experiments.report import write_report
+from experiments.report import where, write_report
 from experiments.results import ResultStore
 
 Spec = Mapping[str, Any]
@@ -140,7 +140,7 @@ def finish(store: ResultStore, specs: Sequence[Spec], console: Console) -> int:
     console.print(console_table(cases))
     report = write_report(store.folder)
     failed = tell_failed(cases, console)
-    console.print(f"report: {report}", markup=False, highlight=False, soft_wrap=True)
+    console.print(where(report), markup=False, highlight=False, soft_wrap=True)
     return 1 if failed else 0
 
 

@@ -24,14 +24,14 @@ def run(options: argparse.Namespace) -> int:
 
 def _report(options: argparse.Namespace, console: Any) -> int:
     from experiments.console_tables import console_table
-    from experiments.report import write_report
+    from experiments.report import where, write_report
     from experiments.results import ResultStore
 
     if not options.folder.is_dir():
         raise ValueError(f"{options.folder} is not a folder of results")
     report = write_report(options.folder)
     console.print(console_table(ResultStore(options.folder).cases()))
-    console.print(f"report: {report}", markup=False, highlight=False, soft_wrap=True)
+    console.print(where(report), markup=False, highlight=False, soft_wrap=True)
     return 0
 
 

@@ -1,7 +1,6 @@
-"""Errors by the path's curvature: one table a setting, for the report and for a terminal."""
+"""Errors by the path's curvature: one table a setting, its lines and what a terminal shows."""
 
-import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -10,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from experiments.band_metrics import BANDS
-from experiments.tables import Estimate, Result, cases_by_setting, estimate, label_of, labels
+from experiments.tables import Estimate, Result, estimate, label_of, labels
 
 NOTE = (
     "ALE, m, where the path's |curvature| at the foot point is in the band: mean over seeds of the "
@@ -81,37 +80,6 @@ def band_ranges() -> list[str]:
     edges = [f"{threshold:g}" for threshold in BANDS.thresholds]
     between = [f"{low} to {high}" for low, high in pairwise(edges)]
     return [f"< {edges[0]}", *between, f"≥ {edges[-1]}"]
-
-
-def curvature_section(cases: Iterable[Result]) -> str:
-    """HTML: a table for each setting; "" where no case knows bands."""
-    parts = []
-    for setting, group in cases_by_setting(cases).items():
-        if lines := band_lines(group):
-            parts.append(f"<h3>{html.escape(setting)}</h3>\n{_html(lines)}")
-    return "\n".join([f"<p>{html.escape(NOTE)}</p>", *parts]) if parts else ""
-
-
-def _html(lines: Iterable[Line]) -> str:
-    heads = "".join(
-        f'<th class="n">{html.escape(name)}<small>{html.escape(words)} 1/m</small></th>'
-        for name, words in zip(BANDS.names, band_ranges(), strict=True)
-    )
-    body = "\n".join(
-        f'<tr><td class="who">{html.escape(label)}</td>'
-        + "".join(
-            f'<td class="n">{cell.error}<small>{html.escape(cell.basis)}</small></td>'
-            if cell
-            else '<td class="n">–</td>'
-            for cell in cells
-        )
-        + "</tr>"
-        for label, cells in lines
-    )
-    return (
-        f'<div class="wide" tabindex="0"><table><thead><tr><th>agent</th>{heads}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody></table></div>"
-    )
 
 
 def console_curvature(cases: Sequence[Result]) -> Table | None:

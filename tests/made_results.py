@@ -2,11 +2,13 @@
 
 from html.parser import HTMLParser
 
+import html5lib
 import numpy as np
 from rich.console import Console
 
 from experiments.console_tables import console_table
 from experiments.report import write_report
+from experiments.reporting.page import asset
 from experiments.results import ResultStore
 
 METRICS = {
@@ -58,6 +60,19 @@ def folder_of(folder, results, traces=True):
 
 def page(folder):
     return write_report(folder).read_text(encoding="utf-8")
+
+
+def own_scripts_alone(text):
+    """Whether all scripts of a page are its own: the files beside the code, and one block of data.
+
+    Parsed as browsers do, strictly: whatever is not valid HTML raises.
+    """
+    parser = html5lib.HTMLParser(strict=True, namespaceHTMLElements=False)
+    scripts = list(parser.parse(text).iter("script"))
+    codes = [one.text for one in scripts if one.get("type") != "application/json"]
+    data = [one for one in scripts if one.get("type") == "application/json"]
+    own = [f"\n{asset(name)}" for name in ("page.js", "replay.js")]
+    return codes in (own, own[:1]) and len(data) <= 1
 
 
 class Outline(HTMLParser):

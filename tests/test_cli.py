@@ -44,8 +44,8 @@ def copy(small: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the report out where it is not what is tested: it takes a second or two."""
-    monkeypatch.setattr("experiments.benchmark.write_report", lambda folder: folder / "none")
+    """Leave the report out where it is not what is tested: it takes a second."""
+    monkeypatch.setattr("experiments.benchmark.write_report", lambda folder: folder / "cases.jsonl")
 
 
 def lines(folder: Path) -> list[dict[str, Any]]:

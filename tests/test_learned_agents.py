@@ -300,7 +300,7 @@ def test_a_cases_id_changes_with_the_policys_weights(spec: dict[str, Any], tmp_p
 def test_a_benchmark_with_a_policy_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("experiments.benchmark.write_report", lambda folder: folder / "none")
+    monkeypatch.setattr("experiments.benchmark.write_report", lambda folder: folder / "cases.jsonl")
     monkeypatch.chdir(tmp_path)
     write(driving_policy("linear"), tmp_path / "mine.json")
     arguments = ["--agents", "mine.json", "--trajectories", "u-turn", "--workers", "1"]

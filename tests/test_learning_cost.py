@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from made_results import HOSTILE, Outline, case, folder_of, page, printed
+from made_results import HOSTILE, Outline, case, folder_of, own_scripts_alone, page, printed
 
 from agents.learned.files import write
 from agents.learned.policy import Policy
@@ -174,7 +174,7 @@ def test_the_report_has_the_cost_beside_the_result_and_in_full(tmp_path):
     for told in ("18,400,000", "6 min", f"# mine.json\n{COST['command']}",
                  "<td>sac</td>", "7,000", "# other.json\n# not recorded"):  # fmt: skip
         assert told in section, told
-    assert section.count("<td>mine.json</td>") == 1
+    assert section.count(">mine.json</th>") == 1
     assert "stanley" not in section
     assert any("designed by hand" in told for told in outline.words)
 
@@ -190,7 +190,7 @@ def test_a_report_without_learned_policies_says_nothing_of_it(tmp_path):
 def test_foreign_words_are_escaped(tmp_path):
     cost = {"algorithm": HOSTILE, "steps": 1, "command": HOSTILE}
     folder_of(tmp_path, [learned(1, HOSTILE, cost)], traces=False)
-    assert "<script" not in page(tmp_path)
+    assert own_scripts_alone(page(tmp_path))
 
 
 def test_the_console_has_a_line_for_each_learned_policy():

@@ -95,11 +95,11 @@ def test_the_page_says_what_was_judged(made: Study, tmp_path: Path) -> None:
         assert words in parsed.text, words
     # In the one band that there is, as everywhere.
     assert "+25.0% (+25.0% to +25.0%)" in parsed.text
-    assert page.count("<figure>") == 4
+    assert page.count('<figure class="plate"') == 4
     # A quarter is half of the half that the greedy oracle finds.
     line = next(line for line in summary["ladder"] if line[0] == "bands")
     assert line[8:11] == ["+25.0%", "+25.0% to +25.0%", "50%"]
-    assert "http" not in page.replace("http://www.w3.org/", "")
+    assert "://" not in page
     assert json.loads((tmp_path / "summary.json").read_text())["greedy"] == 1.0
     assert not math.isnan(summary["headroom"][0]["hindsight"])
 

@@ -1,16 +1,19 @@
-"""Pictures of the tuning study: learning curves, regret, weights and gains by band."""
+"""Figures of the tuning study: learning curves, regret, weights and gains by band."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.ticker import EngFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from agents.weight_tuning.files import load
 from agents.weights import TrackingWeights
 from experiments.band_metrics import BANDS
-from experiments.figures import COLOURS, render
+from experiments.reporting.charts import Chart
+from experiments.reporting.estimate_figures import upright
+from experiments.reporting.path_figures import Panel
+from experiments.reporting.scales import Scale, around, decades
+from experiments.reporting.styles import Styles
 from experiments.tuning.evaluation import EvaluationSet, loop_with
 from experiments.tuning.loop import WEIGHTS
 from experiments.tuning.statistics import Interval
@@ -25,84 +28,81 @@ Array = NDArray[Any]
 GROUPS = {"speed": (0, 4), "heading": (1, 5), "position": (2, 3, 6, 7)}
 """Indices of Q and S by what they weigh."""
 WINDOWS = 40
+HEIGHT = 230.0
 
 
-def _style(k: int) -> tuple[str, str, str]:
-    """Colour, marker and line of the k-th rung: more of them than colours."""
-    again = k // len(COLOURS)
-    return COLOURS[k % len(COLOURS)], "osD^"[again % 4], ("-", "--", ":", "-.")[again % 4]
+def learning_curves(study: Study, styles: Styles) -> list[Panel]:
+    """Scores of what was tried over solves, mean over trainings."""
+    curves = {}
+    for label in styles:
+        runs = [lines for seed in study.seeds if (lines := study.progress(label, seed))]
+        if not runs:
+            continue
+        length = min(len(lines) for lines in runs)
+        solves = np.array([line["solves"] for line in runs[0][:length]], dtype=float)
+        scores = np.mean([[line["score"] for line in lines[:length]] for lines in runs], axis=0)
+        curves[label] = solves, scores
+    if not curves:
+        return []
+    chart = Chart(
+        decades([solves for solves, _ in curves.values()], 1.0),
+        around([scores for _, scores in curves.values()]),
+        x_label="NMPC solves", y_label="score of what was tried", height=HEIGHT,
+    )  # fmt: skip
+    for label, (solves, scores) in curves.items():
+        style = styles[label]
+        chart.line(solves, scores, style.kind, style.width)
+        for x, y in zip(solves, scores, strict=True):
+            chart.dot(float(x), float(y), f"f{style.colour}", 1.4)
+    return [Panel("mean over trainings", chart.svg())]
 
 
-def learning_curves(study: Study, labels: Sequence[str]) -> str:
-    """SVG: scores of what was tried over solves, mean over trainings."""
-
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        for k, label in enumerate(labels):
-            runs = [lines for seed in study.seeds if (lines := study.progress(label, seed))]
-            if not runs:
-                continue
-            length = min(len(lines) for lines in runs)
-            solves = [line["solves"] for line in runs[0][:length]]
-            scores = np.mean([[line["score"] for line in lines[:length]] for lines in runs], axis=0)
-            colour, _, line = _style(k)
-            axes.plot(solves, scores, color=colour, ls=line, label=label, lw=1.0, marker=".", ms=3)
-        axes.set(xlabel="NMPC solves", ylabel="score of what was tried", xscale="log")
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=7)
-
-    return render(draw, 3.0, "learning")
+def regret(rows: Sequence[Judged], greedy: float, styles: Styles) -> list[Panel]:
+    """Score above the greedy oracle's against the solves that it took, 95 % intervals."""
+    ends = [[row.score.low - greedy, row.score.high - greedy] for row in rows]
+    solves = [row.solves for row in rows if row.solves > 0.0]
+    chart = Chart(
+        decades([[0.6 * min(solves), 1.7 * max(solves)]] if solves else [[1.0, 10.0]], 1.0),
+        around(ends, zero=True),
+        x_label="NMPC solves", y_label="regret to the greedy oracle", height=HEIGHT,
+    )  # fmt: skip
+    for k, row in enumerate(rows):
+        style = styles[row.rung.label]
+        value = row.score.value - greedy
+        if row.solves == 0.0:
+            chart.rule(y=value, kind=style.kind)
+            continue
+        # Side by side, where budgets are the same.
+        place = row.solves * 1.08 ** (k - 0.5 * len(rows))
+        upright(chart, place, (row.score.low - greedy, value, row.score.high - greedy), style)
+    return [Panel("95 % intervals", chart.svg())]
 
 
-def regret(rows: Sequence[Judged], greedy: float) -> str:
-    """SVG: score above the greedy oracle's against the solves that it took."""
-
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        for k, row in enumerate(rows):
-            colour, marker, line = _style(k)
-            value = row.score.value - greedy
-            if row.solves == 0.0:
-                axes.axhline(value, color=colour, ls=line, lw=1.0, label=row.rung.label)
-                continue
-            # Side by side, where budgets are the same.
-            axes.errorbar(
-                row.solves * 1.08 ** (k - 0.5 * len(rows)), value,
-                yerr=[[row.score.value - row.score.low], [row.score.high - row.score.value]],
-                color=colour, marker=marker, ms=5, lw=0, elinewidth=1.0, capsize=3,
-                label=row.rung.label,
-            )  # fmt: skip
-        axes.set(xlabel="NMPC solves", ylabel="regret to the greedy oracle", xscale="log")
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=7)
-
-    return render(draw, 3.0, "regret")
+def gains_in_bands(every: Mapping[str, Mapping[str, Interval]], styles: Styles) -> list[Panel]:
+    """Gains over the best fixed set in each band of curvature, 95 % intervals."""
+    ends = [
+        [100 * gain.low, 100 * gain.high] for gains in every.values() for gain in gains.values()
+    ]
+    chart = _bands_chart(around([[0.0], *ends]), "gain over the best fixed set (%)")
+    chart.rule(y=0.0, kind="zero")
+    for k, (label, gains) in enumerate(every.items()):
+        for band, gain in gains.items():
+            interval = 100 * gain.low, 100 * gain.value, 100 * gain.high
+            place = BANDS.names.index(band) + _offset(k, len(every))
+            upright(chart, place, interval, styles[label])
+    return [Panel("95 % intervals", chart.svg())]
 
 
-def gains_in_bands(every: Mapping[str, Mapping[str, Interval]]) -> str:
-    """SVG: gains over the best fixed set in each band of curvature, 95 % intervals."""
+def _bands_chart(y: Scale, words: str) -> Chart:
+    names = BANDS.names
+    return Chart(
+        Scale(-0.5, len(names) - 0.5), y, x_names=names, y_label=words, height=HEIGHT,
+        x_label="|curvature| of the path",
+    )  # fmt: skip
 
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        for k, (label, gains) in enumerate(every.items()):
-            places = [BANDS.names.index(band) + 0.12 * (k - 0.5 * len(every)) for band in gains]
-            values = np.array([[gain.low, gain.value, gain.high] for gain in gains.values()]) * 100
-            low, value, high = values.T
-            axes.errorbar(
-                places, value, yerr=[value - low, high - value], color=COLOURS[k % len(COLOURS)],
-                marker="o", ms=3, capsize=2, lw=0, elinewidth=1.0, label=label,
-            )  # fmt: skip
-        axes.axhline(0.0, color="0.5", lw=0.8)
-        axes.set_xticks(range(len(BANDS.names)), BANDS.names)
-        axes.set(ylabel="gain over the best fixed set, %")
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=7)
 
-    return render(draw, 3.0, "bands")
+def _offset(k: int, count: int) -> float:
+    return 0.7 * ((k + 0.5) / count - 0.5)
 
 
 def weights_in_use(result: Result, given: EvaluationSet) -> tuple[Array, Array]:
@@ -123,36 +123,33 @@ def weights_in_use(result: Result, given: EvaluationSet) -> tuple[Array, Array]:
     return np.concatenate(used), np.concatenate(bands)
 
 
-def weights_over_curvature(study: Study, labels: Sequence[str], given: EvaluationSet) -> str:
-    """SVG: factors on the default weights in each band, medians and quartiles over drives."""
-    names = CurvatureBands().names
+def weights_over_curvature(
+    study: Study, labels: Sequence[str], given: EvaluationSet, styles: Styles
+) -> list[Panel]:
+    """Factors on the default weights in each band, medians and quartiles; a panel a group."""
     base = TrackingWeights().as_array()
-
-    def draw(figure: Any) -> None:
-        every = figure.subplots(1, len(GROUPS), sharey=True)
-        for axes, (group, indices) in zip(every, GROUPS.items(), strict=True):
-            for k, label in enumerate(labels):
-                result = load(study.training(label, study.seeds[0]) / WEIGHTS)
-                used, bands = weights_in_use(result, given)
-                used = np.where(used > 0.0, used, base)
-                factors = np.log10(used[:, list(indices)] / base[list(indices)]).mean(axis=1)
-                places, middles, lows, highs = [], [], [], []
-                for band in range(len(names)):
-                    own = factors[bands == band]
-                    if own.size:
-                        low, middle, high = np.quantile(own, [0.25, 0.5, 0.75])
-                        places.append(band + 0.12 * (k - 0.5 * len(labels)))
-                        middles.append(middle)
-                        lows.append(middle - low)
-                        highs.append(high - middle)
-                axes.errorbar(
-                    places, middles, yerr=[lows, highs], color=COLOURS[k % len(COLOURS)],
-                    marker="o", ms=3, capsize=2, lw=0.8, label=label,
-                )  # fmt: skip
-            axes.set_title(group, fontsize=9)
-            axes.set_xticks(range(len(names)), names, rotation=45, fontsize=7)
-            axes.grid(alpha=0.3)
-        every[0].set_ylabel("lg factor on default Q, S")
-        every[-1].legend(fontsize=7)
-
-    return render(draw, 2.6, "weights")
+    found = {
+        label: weights_in_use(load(study.training(label, study.seeds[0]) / WEIGHTS), given)
+        for label in labels
+    }
+    panels = []
+    for group, indices in GROUPS.items():
+        marks = []
+        for k, (label, (used, bands)) in enumerate(found.items()):
+            in_use = np.where(used > 0.0, used, base)[:, list(indices)]
+            factors = np.log10(in_use / base[list(indices)]).mean(axis=1)
+            for band in range(len(CurvatureBands().names)):
+                own = factors[bands == band]
+                if own.size:
+                    low, middle, high = (float(one) for one in np.quantile(own, [0.25, 0.5, 0.75]))
+                    place = band + _offset(k, len(found))
+                    marks.append((place, (low, middle, high), styles[label]))
+        chart = _bands_chart(
+            around([[0.0], *(interval for _, interval, _ in marks)], least=0.1),
+            "lg factor on default Q, S",
+        )
+        chart.rule(y=0.0, kind="zero")
+        for place, interval, style in marks:
+            upright(chart, place, interval, style)
+        panels.append(Panel(group, chart.svg()))
+    return panels

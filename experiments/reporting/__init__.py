@@ -1,0 +1,1 @@
+"""The report's parts: charts, tables, sections, the interactive replay, the page around them."""
