@@ -14,7 +14,7 @@ import pytest
 
 from experiments import cli
 from experiments.options import parser
-from experiments.report_page import ERRATA
+from experiments.reporting.errata import ERRATA
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
