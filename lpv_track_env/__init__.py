@@ -10,6 +10,7 @@ from types import ModuleType
 from lpv_track_env.registration import register
 
 _SUBMODULES = (
+    "actions",
     "bicycle",
     "conditions",
     "conditions_episode",
@@ -22,6 +23,7 @@ _SUBMODULES = (
     "episodes",
     "estimator",
     "filtering",
+    "highway",
     "integration",
     "kernels",
     "lpv",

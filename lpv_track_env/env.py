@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lpv_track_env import conditions_episode, episodes, kernels, plants, vehicle
+from lpv_track_env import conditions_episode, episodes, kernels, plants
+from lpv_track_env.actions import check_finite, two_numbers
 from lpv_track_env.conditions import Actuation, Conditions
 from lpv_track_env.conditions import load as load_conditions
 from lpv_track_env.conditions_layout import ConditionsArrays
@@ -24,6 +24,7 @@ from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.task import Task, action_space, checked_period, reference
 from lpv_track_env.vector_infos import single_info
 from lpv_track_env.vehicle import VehicleParameters
+from lpv_track_env.vehicle import load as load_vehicle
 from trajectories import ReferencePath
 from trajectories.compilation import entry_point
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from lpv_track_env.rendering import Renderer
 
 RESET_OPTIONS = ("trajectory", "vehicle", *episodes.GIVEN)
-NUMBERS = (float, int)
 INFO: dict[str, Any] = dict.fromkeys(
     (
         "lateral_error", "heading_error", "speed_error", "arc_length", "state", "reward_terms",
@@ -172,7 +172,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
         self.render_mode = render_mode
         self._speed = (speed_mode, fixed_speed)
-        car = _load_vehicle(vehicle)
+        car = load_vehicle(vehicle)
         period = checked_period(control_period)
         self.plant = plant
         self.base_task = Task(
@@ -358,7 +358,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Task of an episode with reset options `trajectory` and `vehicle`, if given."""
         if not {"trajectory", "vehicle"} & set(options):
             return self.base_task
-        car = _load_vehicle(options.get("vehicle", self.base_task.vehicle))
+        car = load_vehicle(options.get("vehicle", self.base_task.vehicle))
         path = self.base_task.path
         if "trajectory" in options:
             path = reference(options["trajectory"], car, *self._speed)
@@ -378,9 +378,9 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if type(values) is list and len(values) == 2:
             a, delta = values
         else:
-            a, delta = _two_numbers(action)
+            a, delta = two_numbers(action)
         if type(a) is not float or type(delta) is not float:
-            a, delta = _two_numbers(action)
+            a, delta = two_numbers(action)
         command = self._command
         command[0] = a
         command[1] = delta
@@ -398,7 +398,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         terminated = truncated = False
         if end:
             if end == kernels.NOT_FINITE:
-                _check_finite(a, delta, action)
+                check_finite(a, delta, action)
             info["end"] = kernels.END_NAMES[end]
             truncated = end == kernels.TIME_LIMIT
             terminated = not truncated
@@ -478,34 +478,3 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.__dict__.update(state)
         self._open_views()
         self._take_table(self._table)
-
-
-def _two_numbers(action: Any) -> tuple[float, float]:
-    """Two real numbers out of anything that holds no more and no less than these."""
-    try:
-        # Through plain Python values: a number is then told from text, bool or complex.
-        values = np.asarray(action).tolist()
-        a, delta = values
-        if not (type(values) is list and type(a) in NUMBERS and type(delta) in NUMBERS):
-            raise TypeError
-        return float(a), float(delta)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(
-            f"action must be two numbers [acceleration m/s^2, steering angle rad], not {action!r}"
-        ) from None
-
-
-def check_action(action: Any) -> None:
-    """Raise the ValueError that `step` raises, if it refuses an action."""
-    a, delta = _two_numbers(action)
-    _check_finite(a, delta, action)
-
-
-def _check_finite(a: float, delta: float, action: Any) -> None:
-    if not (isfinite(a) and isfinite(delta)):
-        entry = "1 (steering angle)" if isfinite(a) else "0 (acceleration)"
-        raise ValueError(f"action entry {entry} is not finite: {action!r}")
-
-
-def _load_vehicle(value: str | Path | VehicleParameters) -> VehicleParameters:
-    return vehicle.load(value)

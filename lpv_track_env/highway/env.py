@@ -11,9 +11,10 @@ from highway_env.road.road import RoadNetwork
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels, plants
+from lpv_track_env.actions import check_action
 from lpv_track_env.bicycle import VX
 from lpv_track_env.conditions import Conditions
-from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv, check_action
+from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.highway import scenes
 from lpv_track_env.highway.cruise import CruiseControl
 from lpv_track_env.highway.ego import EgoVehicle
