@@ -4,6 +4,7 @@ import copy
 import pickle
 import subprocess
 import sys
+from itertools import pairwise
 from typing import Any
 
 import gymnasium
@@ -76,7 +77,7 @@ def go_on(env: HighwayTrackEnv, agent: Any, observation: Any) -> list[dict[str, 
 def test_gymnasiums_and_sb3s_checks_pass(form: str) -> None:
     check_env(make(**FORMS[form]), skip_render_check=True)
     sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
-    # Tuples of dictionaries and unscaled actions are this project's choice: warnings are not failures.
+    # It would like actions within [-1, 1]; here they are SI units.
     sb3.check_env(make(**FORMS[form]), warn=False, skip_render_check=True)
 
 
@@ -124,27 +125,27 @@ def test_every_agent_drives_it_unchanged(name: str, form: str) -> None:
 
 def test_equal_seeds_give_equal_episodes_also_pickled() -> None:
     env = make(other_vehicles=5)
-    agent = agents.make("stanley", env)
 
-    def run(env: HighwayTrackEnv, observation: Any, steps: int) -> tuple[Any, list[Any]]:
+    def run(env: HighwayTrackEnv, first: int, last: int) -> list[Any]:
         seen = []
-        for _ in range(steps):
-            action, _ = agent.predict(observation)
+        for k in range(first, last):
+            action = np.array([0.3, 0.02 * np.sin(0.2 * k)], dtype=np.float32)
             observation, reward, *_, info = env.step(action)
             places = [tuple(one.position) for one in env.others]
-            seen.append((*observation["surroundings"].ravel(), reward, *info["state"], *places))
-        return observation, seen
+            around = tuple(observation["surroundings"].ravel())
+            seen.append((around, reward, tuple(info["state"]), places))
+        return seen
 
-    observation, _ = env.reset(seed=11)
-    first = run(env, observation, 60)[1]
-    observation, _ = env.reset(seed=11)
-    middle, half = run(env, observation, 30)
+    env.reset(seed=11)
+    whole = run(env, 0, 60)
+    env.reset(seed=11)
+    half = run(env, 0, 30)
     copies = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]  # noqa: S301  our own
-    assert half + run(env, middle, 30)[1] == first
+    assert half + run(env, 30, 60) == whole
     for other in copies:
-        assert run(other, middle, 30)[1] == first[30:]
-    observation, _ = env.reset()
-    assert run(env, observation, 10)[1] != first[:10]
+        assert run(other, 30, 60) == whole[30:]
+    env.reset()
+    assert run(env, 0, 10) != whole[:10]
 
 
 def test_the_traffic_of_a_seed_is_highway_envs() -> None:
@@ -194,7 +195,7 @@ def test_laps_are_counted_from_the_start() -> None:
     assert infos[-1]["arc_length"] - begin == pytest.approx(2.0 * env.path.length, abs=0.6)
 
 
-@pytest.mark.parametrize("name", ["lpv-nmpc", "stanley", "ppo"])
+@pytest.mark.parametrize("name", ["lpv-nmpc", "stanley", "pure-pursuit"])
 @pytest.mark.parametrize("body", [Vehicle, Obstacle])
 def test_it_stops_behind_what_stands(name: str, body: type) -> None:
     env = alone(time_limit=30.0)
@@ -311,7 +312,7 @@ def test_frames_show_road_and_traffic() -> None:
 
     shots = frames(1)
     assert all(shot.shape == (600, 900, 3) and shot.mean() > 0 for shot in shots)
-    assert all((a != b).any() for a, b in zip(shots, shots[1:6], strict=False))
+    assert all((a != b).any() for a, b in pairwise(shots[:7]))
     assert all((a == b).all() for a, b in zip(shots, frames(1), strict=True))
     assert any((a != b).any() for a, b in zip(shots, frames(2), strict=True))
     assert (shots[-2] != shots[-1]).any()

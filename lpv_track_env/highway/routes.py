@@ -10,6 +10,7 @@ are taken as they are, and what is left of the path here is drawn right of it th
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -144,10 +145,18 @@ def reference_path(
         With `route`, and how far it passes the lanes' centres, in its metadata.
     """
     points = centre_points(network, route, closed=closed)
-    smoothed = smooth(points, SMOOTHING, closed=closed)
     lanes = [network.get_lane(index) for index in route]
     allowed = [float(lane.speed_limit) for lane in lanes if lane.speed_limit is not None]
     limits = replace(limits, max_speed=min([limits.max_speed, *allowed]))
+    return _fitted(points.tobytes(), limits, closed, name, tuple(route))
+
+
+@lru_cache(maxsize=64)
+def _fitted(
+    points: bytes, limits: SpeedLimits, closed: bool, name: str, route: tuple[LaneIndex, ...]
+) -> ReferencePath:
+    """Fit points, once in a process: roads are made anew for every episode, mostly the same."""
+    smoothed = smooth(np.frombuffer(points).reshape(-1, 2), SMOOTHING, closed=closed)
     return from_geometry(
         smoothed.geometry, limits, name, closed=closed,
         source="highway-env: centre lines of a route, refitted",

@@ -17,7 +17,7 @@ from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.conditions import Actuation
 from lpv_track_env.highway.cruise import CruiseControl
 from lpv_track_env.highway.reference import TrafficReference
-from lpv_track_env.highway.routes import centre_points, lane_route, reference_path, road_ahead
+from lpv_track_env.highway.routes import lane_route, reference_path, road_ahead
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task
@@ -140,7 +140,6 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._throttle = bool(inner.action_type.longitudinal)
         self._cruise = cruise if self._throttle else None
         self._limits = speed_limits
-        self._paths: dict[bytes, ReferencePath] = {}
         bound = self.layout.bound
         self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
         low, high = self.vehicle.acceleration_range
@@ -164,13 +163,8 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise ValueError(f"the vehicle starts from {begin!r} to {end!r}: begin the route there")
         closed = nodes[0] == nodes[-1]
         route = lane_route(network, nodes, int(lane))
-        key = centre_points(network, route, closed=closed).tobytes()
-        if key not in self._paths:
-            name = f"{type(self.highway).__name__}-{lane}"
-            self._paths[key] = reference_path(
-                network, route, self._limits, closed=closed, name=name
-            )
-        path = self._paths[key]
+        name = f"{type(self.highway).__name__}-{lane}"
+        path = reference_path(network, route, self._limits, closed=closed, name=name)
         if not self._throttle:
             path = path.with_speed(max(float(start.speed), 1.0))
         self._reference = TrafficReference(path, self.vehicle, self.layout, self._cruise)
