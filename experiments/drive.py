@@ -13,6 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from experiments.agent_words import agent_notes, world_plan
 from experiments.cases import Case
+from experiments.highway.drives import Drive as TrafficDrive
 from experiments.interrupts import Interrupts
 from experiments.rollout import Rollout, steps
 from experiments.sinks import PngSink, Sink, VideoSink, WindowSink
@@ -34,7 +35,7 @@ class Drive:
         What the path is coloured by, see `lpv_track_env.rendering.Renderer`.
     """
 
-    def __init__(self, case: Case, colour: str) -> None:
+    def __init__(self, case: Case | TrafficDrive, colour: str) -> None:
         self.case = case
         self._env = case.make_env(render_mode="rgb_array", render_colour=colour)
         self._inner: Any = self._env.unwrapped
@@ -79,7 +80,7 @@ class Drive:
 
 
 def drive(
-    case: Case,
+    case: Case | TrafficDrive,
     console: Console,
     *,
     names: Sequence[str] = (),

@@ -239,6 +239,11 @@ def _highway(add: Add) -> None:
     highway.add_argument(
         "--agent-set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the agents"
     )
+    highway.add_argument(
+        "--video", type=Path, metavar="FILE",
+        help="in place of the table a video, .mp4 or .gif, of the last seed; this project's "
+        "agents side by side",
+    )  # fmt: skip
     highway.add_argument("--out", type=Path, default=Path("results/highway"), metavar="DIR")
     highway.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores"

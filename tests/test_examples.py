@@ -23,6 +23,8 @@ NUMBER = r"(-?\d+(?:\.\d+)?(?:e-?\d+)?)"
 def printed(name: str, folder: Path, *more: str) -> str:
     if name == "train_ppo":
         pytest.importorskip("stable_baselines3")
+    if name == "highway_traffic":
+        pytest.importorskip("highway_env")
     words = [sys.executable, ROOT / "examples" / f"{name}.py", *SHORT.get(name, []), *more]
     paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
@@ -59,6 +61,12 @@ def own_path(text: str) -> None:
     ]  # fmt: skip
     assert text.count("finished") == 3
     assert max(numbers("lateral error NUMBER m", text)) < 0.02
+
+
+def highway_traffic(text: str) -> None:
+    assert "lpv-nmpc on racetrack: finished" in text
+    assert numbers("lateral error NUMBER m rms", text)[0] < 0.01
+    assert numbers("least gap NUMBER m", text)[0] > 4.0
 
 
 def own_vehicle(text: str) -> None:
@@ -114,7 +122,7 @@ def derivatives(text: str) -> None:
 CHECKS = {
     check.__name__: check
     for check in (
-        first_drive, own_agent, own_path, own_vehicle, compare_agents, realtime_conditions,
+        first_drive, highway_traffic, own_agent, own_path, own_vehicle, compare_agents, realtime_conditions,
         train_ppo, tune_weights, parallel_vector_env, horizon, derivatives,
     )
 }  # fmt: skip

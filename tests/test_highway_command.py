@@ -70,6 +70,19 @@ def test_a_lap_of_highway_envs_own_ends_where_ours_does() -> None:
     assert own["lateral_rms"] > ours["lateral_rms"]
 
 
+def test_a_video_of_two_agents(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    file = tmp_path / "lap.mp4"
+    main(["highway", "--agents", "stanley", "idm", "pid", "--video", str(file), *SMALL])
+    assert "stanley on racetrack: time_limit" in capsys.readouterr().out
+    reader = imageio_ffmpeg.read_frames(str(file))
+    assert next(reader)["size"] == (1800, 600)
+    frames = list(reader)
+    assert len(frames) >= 40
+    assert frames[0] != frames[30]
+    assert max(frames[0]) > 0
+
+
 def test_a_drive_that_breaks_down_is_a_failed_one(tmp_path: Path) -> None:
     file = tmp_path / "broken.py"
     file.write_text(

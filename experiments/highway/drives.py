@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import agents
-from agents.registry import source_file
+from agents.registry import check_settings, source_file
 from experiments.cases import project_digest
 from lpv_track_env.bicycle import VX
 from lpv_track_env.registration import HIGHWAY_TRACK
@@ -60,6 +60,30 @@ class Drive:
             control_period=self.control_period,
             **{"surroundings": None, **self.env_settings, **settings},
         )
+
+    @property
+    def trajectory(self) -> str:
+        """What is driven, in words."""
+        return self.scene
+
+    def check(self) -> None:
+        """Refuse agents that nothing knows, and those that only `run_drive` knows.
+
+        Raises
+        ------
+        ValueError
+            Saying which.
+        """
+        if self.agent in OWN:
+            raise ValueError(f"{self.agent} is highway-env's own: it has no picture here")
+        check_settings(self.agent, self.agent_settings)
+
+    def make_agent(self, env: gymnasium.Env[Any, Any]) -> agents.Agent:
+        """The drive's agent for its environment."""
+        return agents.make(self.agent, env, **self.agent_settings)
+
+    def make_computing(self) -> None:
+        """Nothing measures computing times here."""
 
 
 @dataclass
@@ -122,7 +146,7 @@ def run_drive(spec: Mapping[str, Any]) -> dict[str, Any]:
 def _agent(drive: Drive) -> dict[str, Any]:
     env = drive.make_env()
     inner: Any = env.unwrapped
-    agent = agents.make(drive.agent, env, **drive.agent_settings)
+    agent = drive.make_agent(env)
     observation, info = env.reset(seed=drive.seed)
     others, begin = len(inner.others), info["arc_length"]
     record, memory, start, done = Record(), None, np.array([True]), False

@@ -131,6 +131,7 @@ class HighwayTrackEnv(PathTrackingEnv):
         time_limit: float | None = None,
         initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
         plant: str | plants.Factory = plants.BICYCLE,
+        render_colour: str = "speed",
     ) -> None:
         self.scene = scenes.load(scene, route)
         if laps < 1 or (laps > 1 and not self.scene.closed):
@@ -152,6 +153,7 @@ class HighwayTrackEnv(PathTrackingEnv):
             preview_steps=preview_steps, preview_period=preview_period,
             reward_weights=reward_weights, max_lateral_error=max_lateral_error,
             time_limit=time_limit, initial_error_range=initial_error_range, plant=plant,
+            render_colour=render_colour,
         )  # fmt: skip
         self.observation_space = self._space(self.observation_space)
 
