@@ -122,8 +122,8 @@ def derivatives(text: str) -> None:
 CHECKS = {
     check.__name__: check
     for check in (
-        first_drive, highway_traffic, own_agent, own_path, own_vehicle, compare_agents, realtime_conditions,
-        train_ppo, tune_weights, parallel_vector_env, horizon, derivatives,
+        first_drive, own_agent, own_path, own_vehicle, compare_agents, realtime_conditions,
+        highway_traffic, train_ppo, tune_weights, parallel_vector_env, horizon, derivatives,
     )
 }  # fmt: skip
 

@@ -1,6 +1,7 @@
 """`lpv-track highway`: drives over seeds, a table, and the results on disk."""
 
 import argparse
+import inspect
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -16,9 +17,14 @@ from experiments.highway.drives import OWN, Drive, run_drive
 from experiments.results import ResultStore
 from lpv_track_env import conditions
 from lpv_track_env.highway import scenes
+from lpv_track_env.highway.env import HighwayTrackEnv
 from lpv_track_env.naming import choose
 
-AGENTS = ("lpv-nmpc", "ppo", "stanley", "idm", "idm-mobil")
+ENV_SETTINGS = tuple(
+    parameter.name
+    for parameter in inspect.signature(HighwayTrackEnv).parameters.values()
+    if parameter.kind is parameter.KEYWORD_ONLY
+)
 
 Result = Mapping[str, Any]
 
@@ -40,6 +46,8 @@ def run_highway(options: argparse.Namespace, console: Console) -> int:
         if agent not in OWN:
             check_settings(agent, agent_settings)
     env_settings: dict[str, Any] = {"laps": options.laps, **parse_settings(options.env)}
+    for key in env_settings:
+        choose("environment setting", key, ENV_SETTINGS)
     if options.other_vehicles is not None:
         env_settings["other_vehicles"] = options.other_vehicles
     drives = [
