@@ -24,7 +24,7 @@ def test_agents_and_highway_envs_own_beside_each_other(
     folder = tmp_path / "out"
     command = ["highway", "--agents", "stanley", "idm", "--out", str(folder), *SMALL]
     assert main(command) == 0
-    told = capsys.readouterr().out
+    told = capsys.readouterr().out.replace("\u00a0", " ")
     assert "stanley" in told
     assert "0 (< 84 %)" in told  # 1 - 0.025^(1/2), Clopper and Pearson
     results = lines(folder)

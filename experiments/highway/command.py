@@ -118,8 +118,8 @@ def table(names: Iterable[str], results: Sequence[Result]) -> Table:
         times = [one["predict_median"] for one in metrics if "predict_median" in one]
         shown.add_row(
             name,
-            f"{finished} of {len(done)}",
-            f"{hit} (< {100 * high:.0f} %)",
+            f"{finished} of {len(done)}".replace(" ", "\u00a0"),
+            f"{hit} (< {100 * high:.0f} %)".replace(" ", "\u00a0"),
             _others(ends),
             f"{_rms([one['lateral_rms'] for one in metrics]):.3f}",
             f"{max(one['lateral_rms'] for one in metrics):.3f}",
