@@ -98,12 +98,15 @@ def _died(spec: Mapping[str, Any]) -> dict[str, Any]:
 
 def table(names: Iterable[str], results: Sequence[Result]) -> Table:
     """Agents, how their drives ended, and how they drove."""
-    shown = Table(title="In highway-env's traffic", title_justify="left")
+    shown = Table(
+        title="In highway-env's traffic; collisions: their number, and what their rate is below (95 %)",
+        title_justify="left",
+    )
     shown.add_column("agent")
     for heading in (
-        "finished", "collisions (95 %)", "other ends", "rms to path m", "worst rms m",
-        "rms to lane m",
-        "least gap m", "speed m/s", "predict ms",
+        "finished", "collisions", "other ends", "rms to path, m", "worst rms, m",
+        "rms to lane, m",
+        "least gap, m", "speed, m/s", "predict, ms",
     ):  # fmt: skip
         shown.add_column(heading, justify="right")
     for name in names:
@@ -118,8 +121,8 @@ def table(names: Iterable[str], results: Sequence[Result]) -> Table:
         times = [one["predict_median"] for one in metrics if "predict_median" in one]
         shown.add_row(
             name,
-            f"{finished} of {len(done)}".replace(" ", "\u00a0"),
-            f"{hit} (< {100 * high:.0f} %)".replace(" ", "\u00a0"),
+            f"{finished} of {len(done)}",
+            f"{hit} (<{100 * high:.0f}%)",
             _others(ends),
             f"{_rms([one['lateral_rms'] for one in metrics]):.3f}",
             f"{max(one['lateral_rms'] for one in metrics):.3f}",
