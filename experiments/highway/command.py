@@ -99,7 +99,7 @@ def _died(spec: Mapping[str, Any]) -> dict[str, Any]:
 def table(names: Iterable[str], results: Sequence[Result]) -> Table:
     """Agents, how their drives ended, and how they drove."""
     shown = Table(
-        title="In highway-env's traffic; collisions: their number, and what their rate is below (95 %)",
+        title="In highway-env's traffic (collisions: how many, and 95 % bound of their rate)",
         title_justify="left",
     )
     shown.add_column("agent")
