@@ -31,16 +31,20 @@ class Camera:
     def __init__(self) -> None:
         self._stages: Array | None = None
         self._time = 0.0
+        self._wider = 1.0
 
-    def begin(self) -> None:
-        """Forget the last episode: the next place is looked at without easing."""
-        self._stages = None
+    def begin(self, wider: float = 1.0) -> None:
+        """Forget the last episode: the next place is looked at without easing.
+
+        `wider` times as much is seen as usual.
+        """
+        self._stages, self._wider = None, wider
 
     def follow(
         self, time: float, vx: float, x: float, y: float, s: float, path: ReferencePath
     ) -> None:
         """Take in where the vehicle is at some time (s): speed (m/s), position, arc length (m)."""
-        width = float(np.clip(NEAREST + WIDER * abs(vx), NEAREST, FURTHEST))
+        width = self._wider * float(np.clip(NEAREST + WIDER * abs(vx), NEAREST, FURTHEST))
         look = float(np.clip(LOOK_AHEAD * vx, SHORTEST_LOOK, LONGEST_LOOK))
         ahead = s + look
         ahead = ahead % path.length if path.closed else min(ahead, path.length)

@@ -47,6 +47,8 @@ Array = NDArray[np.float64]
 
 PLAN_SPACING = 8.0
 """Pixels of the frame between a plan's drawn nodes at least."""
+ROADS_WIDER = 1.4
+"""How much more is seen where there is a scenery."""
 KEPT_TRACKS = 8
 """Paths that are kept ready: a vector environment draws one after the other."""
 
@@ -115,7 +117,8 @@ class Renderer:
         self._task = task
         self.plan, self.notes, self.others = None, {}, None
         self._history = History(task.control_period)
-        self._camera.begin()
+        # On roads there are others to look out for.
+        self._camera.begin(1.0 if scenery is None else ROADS_WIDER)
         self._track = self._track_of(task)
         self._vehicle = VehicleDrawing(task.vehicle)
         self._cards = Cards(task, self._letters)
