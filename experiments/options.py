@@ -244,6 +244,10 @@ def _highway(add: Add) -> None:
         help="in place of the table a video, .mp4 or .gif, of the last seed; this project's "
         "agents side by side",
     )  # fmt: skip
+    highway.add_argument(
+        "--frames", type=Path, metavar="DIR", help="likewise PNG files, one every --every steps"
+    )
+    highway.add_argument("--every", type=int, default=20, metavar="N", help="default 20")
     highway.add_argument("--out", type=Path, default=Path("results/highway"), metavar="DIR")
     highway.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores"

@@ -59,12 +59,15 @@ def run_highway(options: argparse.Namespace, console: Console) -> int:
         for agent in options.agents
         for seed in range(options.seeds)
     ]  # fmt: skip
-    if options.video is not None:
+    if options.video is not None or options.frames is not None:
         from experiments.drive import drive
 
         first = next(one for one in drives if one.seed == options.seeds - 1)
         shown = [name for name in options.agents if name not in OWN]
-        return drive(first, console, names=shown, video=options.video)
+        return drive(
+            first, console, names=shown, video=options.video, frames=options.frames,
+            every=options.every,
+        )  # fmt: skip
     # What cannot be made is told once, before anything is driven.
     drives[0].make_env().close()
     store = ResultStore(options.out)
