@@ -19,8 +19,9 @@ def lines(folder: Path) -> list[dict[str, Any]]:
 
 
 def test_agents_and_highway_envs_own_beside_each_other(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "150")
     folder = tmp_path / "out"
     command = ["highway", "--agents", "stanley", "idm", "--out", str(folder), *SMALL]
     assert main(command) == 0
