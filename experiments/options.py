@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments.bags.arguments import add_bag_parsers
+from experiments.highway.options import add_highway_options
 from experiments.parallel.options import add_parallel_options
 from experiments.training.options import add_training_options
 from experiments.tuning.options import add_study_options, add_tuning_options
@@ -209,48 +210,12 @@ def _switching(add: Add) -> None:
 
 
 def _highway(add: Add) -> None:
-    highway = add(
-        "highway",
-        "Drive laps among highway-env's traffic, beside its own controllers.",
-        "lpv-track highway --scene racetrack --agents lpv-nmpc ppo idm --seeds 20",
-    )
-    highway.add_argument(
-        "--scene", default="racetrack", metavar="NAME",
-        help="racetrack (default), racetrack-large, racetrack-oval, roundabout, "
-        "roundabout-generic",
-    )  # fmt: skip
-    highway.add_argument(
-        "--agents", nargs="+", default=["lpv-nmpc", "ppo", "stanley", "idm", "idm-mobil"],
-        metavar="NAME",
-        help="names of agents, files of policies; idm and idm-mobil are highway-env's own "
-        "(default: lpv-nmpc ppo stanley idm idm-mobil)",
-    )  # fmt: skip
-    highway.add_argument("--seeds", type=int, default=20, metavar="N", help="default 20")
-    highway.add_argument(
-        "--other-vehicles", type=int, metavar="N",
-        help="in the scene's terms: racetracks draw 1 to N (default: highway-env's own, 1)",
-    )  # fmt: skip
-    highway.add_argument("--laps", type=int, default=1, metavar="N", help="default 1")
-    highway.add_argument("--conditions", default="simulation", metavar="NAME")
-    highway.add_argument("--control-period", type=float, default=0.05, metavar="S")
-    highway.add_argument(
-        "--env", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the environment"
-    )
-    highway.add_argument(
-        "--agent-set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the agents"
-    )
-    highway.add_argument(
-        "--video", type=Path, metavar="FILE",
-        help="in place of the table a video, .mp4 or .gif, of the last seed; this project's "
-        "agents side by side",
-    )  # fmt: skip
-    highway.add_argument(
-        "--frames", type=Path, metavar="DIR", help="likewise PNG files, one every --every steps"
-    )
-    highway.add_argument("--every", type=int, default=20, metavar="N", help="default 20")
-    highway.add_argument("--out", type=Path, default=Path("results/highway"), metavar="DIR")
-    highway.add_argument(
-        "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores"
+    add_highway_options(
+        add(
+            "highway",
+            "Drive laps among highway-env's traffic, beside its own controllers.",
+            "lpv-track highway --scene racetrack --agents lpv-nmpc ppo idm --seeds 20",
+        )
     )
 
 
