@@ -96,6 +96,9 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
     a controller something to control. Where its action has no throttle, the reference's speed is
     the one that the vehicle has, and no gap is kept.
 
+    Infos have, beside highway-env's, `lateral_error`, `heading_error`, `speed_error`, `arc_length`
+    and `state` as in path tracking, and `gap`.
+
     Parameters
     ----------
     env
@@ -109,9 +112,6 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         Of the reference.
     preview_steps
         K, of a control period each.
-
-    Infos have, beside highway-env's, `lateral_error`, `heading_error`, `speed_error`, `arc_length`
-    and `state` as in path tracking, and `gap`.
 
     Raises
     ------
