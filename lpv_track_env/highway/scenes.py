@@ -183,7 +183,8 @@ def path_of(scene: Scene, lane: int, limits: SpeedLimits) -> ReferencePath:
 class NetworkEnv(AbstractEnv):
     """An environment of highway-env on any network: IDM vehicles on its lanes, at random.
 
-    The ego vehicle starts on the first road of the route, on a lane drawn at random.
+    The ego vehicle starts on the first road of the route, on a lane drawn at random. It makes roads
+    only, and is never stepped.
     """
 
     APART = 20.0
@@ -223,12 +224,3 @@ class NetworkEnv(AbstractEnv):
             )
             if not any(near):
                 self.road.vehicles.append(other)
-
-    def _reward(self, action: Any) -> float:  # noqa: ARG002  highway-env's signature
-        return 0.0
-
-    def _is_terminated(self) -> bool:
-        return bool(self.vehicle.crashed)
-
-    def _is_truncated(self) -> bool:
-        return False
