@@ -298,6 +298,16 @@ def test_a_path_is_no_option_of_reset() -> None:
         env.reset(options={"trajectory": "T1"})
 
 
+def test_a_reset_that_is_refused_leaves_no_half_episode() -> None:
+    env = make(other_vehicles=5)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="lateral_error must be a finite number"):
+        env.reset(seed=1, options={"lateral_error": np.nan})
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(2, dtype=np.float32))
+    assert abs(env.reset(seed=1)[1]["lateral_error"]) < 1e-9
+
+
 def test_frames_show_road_and_traffic() -> None:
     def frames(seed: int) -> list[np.ndarray[Any, Any]]:
         env = make(other_vehicles=8, render_mode="rgb_array")

@@ -47,7 +47,7 @@ def drive_own(
     )  # fmt: skip
     car.MIN_SPEED = 0.0
     road.vehicles[road.vehicles.index(start)] = car
-    others = [one for one in (*road.vehicles, *road.objects) if one is not car]
+    others = traffic.others_on(road, car)
     period, cruise, record = task.control_period, CruiseControl(), Record()
     s = begin = path.project(*car.position).arc_length
     goal = begin + env.laps * path.length if path.closed else path.length

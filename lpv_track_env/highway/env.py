@@ -19,6 +19,7 @@ from lpv_track_env.highway import scenes
 from lpv_track_env.highway.cruise import CruiseControl
 from lpv_track_env.highway.ego import EgoVehicle
 from lpv_track_env.highway.reference import TrafficReference
+from lpv_track_env.highway.traffic import others_on
 from lpv_track_env.naming import choose
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task
@@ -142,7 +143,6 @@ class HighwayTrackEnv(PathTrackingEnv):
         self.speed_limits = speed_limits or SpeedLimits(
             max_speed=self.scene.max_speed, max_lateral_acceleration=2.0, max_acceleration=1.5
         )
-        self._time_limit = time_limit
         config = _observation_config(surroundings)
         self.highway = self.scene.make(other_vehicles, config or SURROUNDINGS["lidar"])
         self._surrounded = config is not None
@@ -178,7 +178,7 @@ class HighwayTrackEnv(PathTrackingEnv):
     def episode_task(self, options: Mapping[str, Any]) -> Task:
         """Task of an episode with reset options `trajectory` and `vehicle`, if given."""
         task = super().episode_task(options)
-        limit = self._time_limit
+        limit = task.time_limit
         if limit is None:
             limit = self.laps * 2.0 * task.path.duration + EXTRA_TIME
         return replace(task, time_limit=limit, vehicle=stoppable(task.vehicle))
@@ -191,6 +191,8 @@ class HighwayTrackEnv(PathTrackingEnv):
         for key in options:
             choose("reset option", key, OPTIONS)
         drawn = int(self.np_random.integers(2**31)) if seed is None else seed
+        # What is still refused below leaves no episode: its road is gone.
+        self._running = False
         start = scenes.populate(self.highway, drawn)
         path = scenes.path_of(self.scene, int(start.lane_index[2]), self.speed_limits)
         options.setdefault("arc_length", path.project(*start.position).arc_length)
@@ -233,8 +235,7 @@ class HighwayTrackEnv(PathTrackingEnv):
     @property
     def others(self) -> list[Any]:
         """Every other body on the road: highway-env's vehicles and objects."""
-        road = self.highway.road
-        return [one for one in (*road.vehicles, *road.objects) if one is not self._ego]
+        return others_on(self.highway.road, self._ego)
 
     def _look_ahead(self) -> None:
         """Find who is ahead, and lower the reference's speed to keep the gap."""

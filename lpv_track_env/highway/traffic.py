@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle
 from highway_env.vehicle.objects import RoadObject
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,11 @@ Array = NDArray[np.float64]
 
 FORESEEN = (0.75, 1.5, 2.25, 3.0)
 """s ahead, at which vehicles that follow their lanes at constant speed are looked for again."""
+
+
+def others_on(road: Road, ego: RoadObject | None) -> list[RoadObject]:
+    """Every body on a road but one: highway-env's vehicles and objects."""
+    return [one for one in (*road.vehicles, *road.objects) if one is not ego]
 
 
 class Sighting(NamedTuple):

@@ -18,6 +18,7 @@ from lpv_track_env.conditions import Actuation
 from lpv_track_env.highway.cruise import CruiseControl
 from lpv_track_env.highway.reference import TrafficReference
 from lpv_track_env.highway.routes import lane_route, reference_path, road_ahead
+from lpv_track_env.highway.traffic import others_on
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task
@@ -193,8 +194,8 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _look_ahead(self) -> None:
         road, car = self.highway.road, self.highway.vehicle
-        others = [one for one in (*road.vehicles, *road.objects) if one is not car]
-        self._reference.look(float(self._memory[kernels.ARC_LENGTH]), float(car.speed), others)
+        s = float(self._memory[kernels.ARC_LENGTH])
+        self._reference.look(s, float(car.speed), others_on(road, car))
 
     def _info(self) -> dict[str, Any]:
         m = self._memory
