@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from experiments.agent_words import agent_notes, world_plan
 from experiments.cases import Case
-from experiments.highway.drives import Drive as TrafficDrive
+from experiments.highway.drives import TrafficDrive
 from experiments.interrupts import Interrupts
 from experiments.rollout import Rollout, steps
 from experiments.sinks import PngSink, Sink, VideoSink, WindowSink

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("highway_env")
 
 from experiments.cli import main
-from experiments.highway.drives import Drive, run_drive
+from experiments.highway.drives import TrafficDrive, run_drive
 
 SMALL = ["--env", "time_limit=2.0", "--seeds", "2", "--workers", "1"]
 
@@ -55,7 +55,7 @@ def test_a_drive_is_its_spec(agent: str) -> None:
         one["metrics"].pop("predict_median", None)
     assert once == again
     assert once["metrics"]["progress"] > 10.0
-    other = Drive(**{**spec, "seed": 4})
+    other = TrafficDrive(**{**spec, "seed": 4})
     assert other.id != once["id"]
 
 

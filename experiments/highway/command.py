@@ -13,7 +13,7 @@ from scipy.stats import binomtest
 from agents.registry import check_settings
 from experiments.benchmark import parse_settings, progress_bar
 from experiments.engines import local_pool
-from experiments.highway.drives import OWN, Drive, run_drive
+from experiments.highway.drives import OWN, TrafficDrive, run_drive
 from experiments.results import ResultStore
 from lpv_track_env import conditions
 from lpv_track_env.highway import scenes
@@ -30,7 +30,7 @@ Result = Mapping[str, Any]
 
 
 def run_highway(options: argparse.Namespace, console: Console) -> int:
-    """Drive every agent on every seed, print the table; drives that are there are kept.
+    """TrafficDrive every agent on every seed, print the table; drives that are there are kept.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def run_highway(options: argparse.Namespace, console: Console) -> int:
     if options.other_vehicles is not None:
         env_settings["other_vehicles"] = options.other_vehicles
     drives = [
-        Drive(
+        TrafficDrive(
             agent=agent, scene=options.scene, seed=seed, conditions=options.conditions,
             control_period=options.control_period, env_settings=env_settings,
             agent_settings={} if agent in OWN else agent_settings,
@@ -94,7 +94,7 @@ def run_highway(options: argparse.Namespace, console: Console) -> int:
 
 def _died(spec: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        "id": Drive(**spec).id, **spec, "status": "failed", "end": None, "metrics": {},
+        "id": TrafficDrive(**spec).id, **spec, "status": "failed", "end": None, "metrics": {},
         "others": None, "error": "the worker process died, twice", "seconds": 0.0,
     }  # fmt: skip
 

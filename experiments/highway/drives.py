@@ -25,7 +25,7 @@ OWN = {"idm": "IDM and highway-env's own steering", "idm-mobil": "the same, and 
 
 
 @dataclass(frozen=True)
-class Drive:
+class TrafficDrive:
     """Everything that determines one drive.
 
     `agent` is one of this project's, or of `OWN`; `agent_settings` and `env_settings` are keyword
@@ -124,7 +124,7 @@ def run_drive(spec: Mapping[str, Any]) -> dict[str, Any]:
     Parameters
     ----------
     spec
-        Fields of `Drive`.
+        Fields of `TrafficDrive`.
 
     Returns
     -------
@@ -132,7 +132,7 @@ def run_drive(spec: Mapping[str, Any]) -> dict[str, Any]:
         `id`, the spec's fields, `status` ("ok" or "failed" with `error`), `end`, `others` (their
         number at the start), `metrics`, `seconds`.
     """
-    drive = Drive(**spec)
+    drive = TrafficDrive(**spec)
     result: dict[str, Any] = {"id": drive.id, **asdict(drive), "status": "ok", "error": None}
     began = time.perf_counter()
     try:
@@ -143,7 +143,7 @@ def run_drive(spec: Mapping[str, Any]) -> dict[str, Any]:
     return {**result, **driven, "seconds": time.perf_counter() - began}
 
 
-def _agent(drive: Drive) -> dict[str, Any]:
+def _agent(drive: TrafficDrive) -> dict[str, Any]:
     env = drive.make_env()
     inner: Any = env.unwrapped
     agent = drive.make_agent(env)
@@ -169,7 +169,7 @@ def _agent(drive: Drive) -> dict[str, Any]:
     }
 
 
-def _own(drive: Drive) -> dict[str, Any]:
+def _own(drive: TrafficDrive) -> dict[str, Any]:
     from experiments.highway.own import drive_own
 
     env: Any = drive.make_env()
