@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from scipy.stats import binomtest
 
 from agents.registry import check_settings
 from experiments.benchmark import parse_settings, progress_bar
 from experiments.engines import local_pool
 from experiments.highway.drives import OWN, TrafficDrive, run_drive
+from experiments.reporting.failures import rate_interval
 from experiments.results import ResultStore
 from lpv_track_env import conditions
 from lpv_track_env.highway import scenes
@@ -118,7 +118,7 @@ def table(names: Iterable[str], results: Sequence[Result]) -> Table:
             continue
         ends = [case["end"] for case in done]
         finished, hit = ends.count("finished"), ends.count("collision")
-        high = binomtest(hit, len(done)).proportion_ci(method="exact").high
+        _, high = rate_interval(hit, len(done))
         metrics = [case["metrics"] for case in done]
         gaps = [one["least_gap"] for one in metrics if "least_gap" in one]
         times = [one["predict_median"] for one in metrics if "predict_median" in one]
