@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.conditions import Actuation
-from lpv_track_env.conditions_vehicle import controlled_stop
+from lpv_track_env.conditions.vehicle import controlled_stop
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath

@@ -6,7 +6,7 @@ from collections import defaultdict
 import numpy as np
 from scipy.stats import t as student
 
-from experiments.engines import local_pool
+from experiments.run.engines import local_pool
 
 
 def main() -> None:

@@ -3,7 +3,7 @@
 import argparse
 
 from agents import TrackingAgent
-from experiments.cases import run_case
+from experiments.run.case import run_case
 from lpv_track_env.observation import TrackingObservation
 
 

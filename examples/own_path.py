@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 import trajectories
-from experiments.cases import run_case
+from experiments.run.case import run_case
 from trajectories import SpeedLimits, shapes
 from trajectories.catalog import from_geometry
 from trajectories.files import write

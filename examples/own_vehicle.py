@@ -4,7 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
-from experiments.cases import run_case
+from experiments.run.case import run_case
 from lpv_track_env.vehicle import VEHICLES
 
 

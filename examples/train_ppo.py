@@ -11,7 +11,7 @@ from stable_baselines3 import PPO
 import agents
 from agents.learned import write
 from agents.learned.learner import LearnerVecEnv
-from experiments.cases import run_case
+from experiments.run.case import run_case
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import agents
-from agents.nmpc.closed_loop import ClosedLoop
+from agents.weight_tuning.closed_loop import ClosedLoop
 from agents.weight_tuning.score import scores_of
 from agents.weights import TrackingWeights
 from lpv_track_env.vector_env import PathTrackingVectorEnv

@@ -6,8 +6,8 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from experiments.engines import one_thread
 from experiments.options import parser
+from experiments.run.engines import one_thread
 
 EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
@@ -23,9 +23,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace, console: Any) -> int:
-    from experiments.console_tables import console_table
-    from experiments.report import where, write_report
-    from experiments.results import ResultStore
+    from experiments.report.build import where, write_report
+    from experiments.run.console_tables import console_table
+    from experiments.run.store import ResultStore
 
     if not options.folder.is_dir():
         raise ValueError(f"{options.folder} is not a folder of results")
@@ -36,9 +36,9 @@ def _report(options: argparse.Namespace, console: Any) -> int:
 
 
 def _drive(options: argparse.Namespace, console: Any) -> int:
-    from experiments.benchmark import parse_settings
-    from experiments.cases import Case
     from experiments.drive import drive
+    from experiments.run.benchmark import parse_settings
+    from experiments.run.case import Case
 
     if options.agent is not None and options.agents:
         raise ValueError("give --agent or --agents, not both")
@@ -85,8 +85,8 @@ def _verify(options: argparse.Namespace, console: Any) -> int:
 
 
 def _benchmark(options: argparse.Namespace, console: Any) -> int:
-    from experiments import suites
-    from experiments.benchmark import distinct, finish, parse_settings, run_benchmark
+    from experiments.run import suites
+    from experiments.run.benchmark import distinct, finish, parse_settings, run_benchmark
     from lpv_track_env.naming import choose
 
     if options.seeds < 1:
@@ -146,7 +146,7 @@ def _realtime(options: argparse.Namespace, console: Any) -> int:
 
 
 def _switching(options: argparse.Namespace, console: Any) -> int:
-    from experiments.tuning.switching_command import run_switching
+    from experiments.robustness.command import run_switching
 
     try:
         return run_switching(options, console)
@@ -167,7 +167,7 @@ def _highway(options: argparse.Namespace, console: Any) -> int:
 
 def conditions_of(options: argparse.Namespace) -> str | dict[str, Any]:
     """Conditions by name, or a dictionary of what departs from them."""
-    from experiments.benchmark import parse_settings
+    from experiments.run.benchmark import parse_settings
 
     changes = parse_settings(options.conditions_set)
     name = options.conditions or "simulation"
@@ -188,7 +188,7 @@ def merged(spec: dict[str, object], changes: dict[str, Any]) -> dict[str, object
 
 def _trajectories(options: argparse.Namespace, console: Any) -> int:
     import trajectories
-    from experiments.suites import RAW, SIX
+    from experiments.run.suites import RAW, SIX
     from experiments.trajectory_figures import draw, rows_table
 
     names = options.names or [*SIX, *RAW]
@@ -210,16 +210,16 @@ def _trajectories(options: argparse.Namespace, console: Any) -> int:
 
 
 def _bag(options: argparse.Namespace, console: Any) -> int:
-    from experiments.bags.command import run_bag
+    from experiments.ros.command import run_bag
 
     return run_bag(options, console)
 
 
 def _run_parallel(options: argparse.Namespace, console: Any) -> int:
-    from experiments.benchmark import parse_settings
     from experiments.parallel import command
     from experiments.parallel.options import SETTINGS
     from experiments.parallel.setup import Setup
+    from experiments.run.benchmark import parse_settings
 
     if options.bench_mailbox:
         return command.bench(options.out, console)
@@ -244,7 +244,7 @@ def _tune(options: argparse.Namespace, console: Any) -> int:
 
 
 def _tuning_study(options: argparse.Namespace, console: Any) -> int:
-    from experiments.tuning.study_command import run_study
+    from experiments.study.command import run_study
 
     return run_study(options, console)
 

@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from experiments.agent_words import agent_notes, world_plan
-from experiments.cases import Case
 from experiments.highway.drives import TrafficDrive
-from experiments.interrupts import Interrupts
-from experiments.rollout import Rollout, steps
+from experiments.run.case import Case
+from experiments.run.interrupts import Interrupts
+from experiments.run.rollout import Rollout, steps
 from experiments.sinks import PngSink, Sink, VideoSink, WindowSink
 
 Frame = NDArray[np.uint8]

@@ -5,9 +5,9 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments.bags.arguments import add_bag_parsers
 from experiments.highway.options import add_highway_options
 from experiments.parallel.options import add_parallel_options
+from experiments.ros.arguments import add_bag_parsers
 from experiments.training.options import add_training_options
 from experiments.tuning.options import add_study_options, add_tuning_options
 

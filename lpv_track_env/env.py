@@ -10,11 +10,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lpv_track_env import conditions_episode, episodes, kernels, plants
+from lpv_track_env import episodes, kernels, plants
 from lpv_track_env.actions import check_finite, two_numbers
 from lpv_track_env.conditions import Actuation, Conditions
+from lpv_track_env.conditions import episode as conditions_episode
 from lpv_track_env.conditions import load as load_conditions
-from lpv_track_env.conditions_layout import ConditionsArrays
+from lpv_track_env.conditions.layout import ConditionsArrays
 from lpv_track_env.draws import random_key
 from lpv_track_env.episodes import given_start
 from lpv_track_env.naming import choose

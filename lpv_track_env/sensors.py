@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lpv_track_env import conditions_layout, conditions_sensors
 from lpv_track_env.bicycle import PSI, STATE_SIZE, VX, YAW_RATE
 from lpv_track_env.conditions import DRAWN, Conditions
+from lpv_track_env.conditions import layout as conditions_layout
+from lpv_track_env.conditions import sensors as conditions_sensors
 from lpv_track_env.draws import random_key
 from trajectories.compilation import compiled
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lpv_track_env import kernels, vector_kernels
 from lpv_track_env.conditions import Conditions
-from lpv_track_env.conditions_vector import ConditionsVector
+from lpv_track_env.conditions.vector import ConditionsVector
 from lpv_track_env.draws import random_key
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.episodes import GIVEN, given_start

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agents.base import DrivingTask, TrackingAgent
-from agents.geometric import Stanley
+from agents.classical.geometric import Stanley
 from agents.nmpc.problem import NmpcProblem
-from agents.nmpc.switching import Switching
+from agents.nmpc.schedule import Switching
 from agents.reference import local_reference
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import TrackingObservation

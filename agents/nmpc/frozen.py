@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from agents.base import DrivingTask
-from agents.nmpc.agent import SolvedNmpc
+from agents.nmpc.ipopt_agent import SolvedNmpc
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.nmpc.rti_solver import RtiSolver

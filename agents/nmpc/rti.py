@@ -46,7 +46,7 @@ from agents.nmpc.layout import (
     SPACE_LOW_DELTA,
 )
 from agents.nmpc.linearisation import differentiate
-from agents.nmpc.program import (
+from agents.nmpc.qp import (
     CODE,
     COST,
     INNER,

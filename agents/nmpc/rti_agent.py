@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Action, DrivingTask, observation_rows
-from agents.nmpc import layout, program, rti
+from agents.nmpc import layout, rti
+from agents.nmpc import qp as program
 from agents.nmpc.base import Ladder, NmpcAgent
 from agents.nmpc.problem import INPUTS, STATES
 from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
-from agents.nmpc.switching import NO_BAND, WEIGHTS
+from agents.nmpc.schedule import NO_BAND, WEIGHTS
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.threads import checked_threads, shares, using_threads

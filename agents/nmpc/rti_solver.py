@@ -5,7 +5,8 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc import layout, linearisation, program, rti, sqp
+from agents.nmpc import layout, linearisation, rti, sqp
+from agents.nmpc import qp as program
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import STATES, NmpcProblem, Solution, Status
 

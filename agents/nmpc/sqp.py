@@ -31,7 +31,7 @@ from agents.nmpc.layout import (
 )
 from agents.nmpc.linearisation import advance
 from agents.nmpc.problem import Status
-from agents.nmpc.program import clamp
+from agents.nmpc.qp import clamp
 from agents.nmpc.rti import cost_of
 from agents.nmpc.vectors import taken
 from lpv_track_env.bicycle import compiled_field, compiled_inverse_speed

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from agents.base import Action, DrivingTask, observation_rows
 from agents.delay import NearFuture, moved_plan
 from agents.made_for import check_task
-from agents.nmpc import program
-from agents.nmpc.loop_memory import LoopMemory, LoopRow
+from agents.nmpc import qp as program
 from agents.nmpc.rti_agent import RtiNmpc
 from agents.nmpc.rti_solver import DAMPING
 from agents.reference import NODE
@@ -19,6 +18,7 @@ from agents.registry import CHECKPOINTS
 from agents.weight_tuning.deciding import NOBODY, Decider
 from agents.weight_tuning.deciding_rows import finish_rows, prepare_rows
 from agents.weight_tuning.files import load
+from agents.weight_tuning.loop_memory import LoopMemory, LoopRow
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.watching import REJECTED
 from agents.weights import TrackingWeights, WeightSchedule

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.learned.policy import checked_number
-from agents.nmpc.switching import rules_of
+from agents.nmpc.schedule import rules_of
 from agents.weight_tuning.features import TUNED
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
 from lpv_track_env.naming import choose

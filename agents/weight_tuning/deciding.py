@@ -17,7 +17,7 @@ from agents.weight_tuning.watching import CLOCK, DECIDED, FAILURES, ITERATIONS, 
 from trajectories.compilation import compiled
 
 if TYPE_CHECKING:
-    from agents.nmpc.loop_memory import LoopMemory
+    from agents.weight_tuning.loop_memory import LoopMemory
 
 Array = NDArray[Any]
 Layers = tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]

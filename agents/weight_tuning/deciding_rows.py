@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from agents.nmpc.closed_loop_kernels import attend, choose, remember, solved
+from agents.weight_tuning.loop_kernels import attend, choose, remember, solved
 from agents.weight_tuning.watching import passed
 from trajectories.compilation import compiled
 

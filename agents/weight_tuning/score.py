@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc.closed_loop import Tally
+from agents.weight_tuning.closed_loop import Tally
 from lpv_track_env import kernels as k
 
 Array = NDArray[Any]

@@ -11,8 +11,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 import agents
-from agents.nmpc.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.choice import WeightChoice
+from agents.weight_tuning.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.score import FAILED, failed, marginal_parts, parts_of, scores_of
 from agents.weight_tuning.spaces import action_space, checked_choices, observation_space

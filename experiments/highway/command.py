@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.table import Table
 
 from agents.registry import check_settings
-from experiments.benchmark import parse_settings, progress_bar
-from experiments.engines import local_pool
 from experiments.highway.drives import OWN, TrafficDrive, run_drive
-from experiments.reporting.failures import rate_interval
-from experiments.results import ResultStore
+from experiments.report.failures import rate_interval
+from experiments.run.benchmark import parse_settings, progress_bar
+from experiments.run.engines import local_pool
+from experiments.run.store import ResultStore
 from lpv_track_env import conditions
 from lpv_track_env.highway import scenes
 from lpv_track_env.highway.env import HighwayTrackEnv

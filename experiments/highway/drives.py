@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import agents
 from agents.registry import check_settings, source_file
-from experiments.cases import project_digest
+from experiments.run.case import project_digest
 from lpv_track_env.bicycle import VX
 from lpv_track_env.registration import HIGHWAY_TRACK
 

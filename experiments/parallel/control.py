@@ -22,7 +22,7 @@ from experiments.parallel.messages import (
 from experiments.parallel.processes import ATTACHED, READY, Link, quiet
 from experiments.parallel.setup import Setup
 from lpv_track_env.bicycle import VX, X, Y
-from lpv_track_env.observer import PathObserver
+from lpv_track_env.estimation.observer import PathObserver
 from lpv_track_env.vehicle import VehicleParameters
 
 WARM_UP = 20

@@ -11,8 +11,8 @@ from experiments.parallel.messages import ESTIMATE, SAMPLE
 from experiments.parallel.processes import ATTACHED, READY, Link, quiet
 from experiments.parallel.setup import MS_PER_SECOND, Setup
 from lpv_track_env import vehicle
-from lpv_track_env.conditions_layout import WORST_OFFSET
-from lpv_track_env.estimator import Estimator
+from lpv_track_env.conditions.layout import WORST_OFFSET
+from lpv_track_env.estimation.estimator import Estimator
 
 LOOK = 0.02
 """s between looks at the link while no sample comes."""

@@ -9,10 +9,10 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from experiments.metrics import rms
 from experiments.parallel.messages import DRIVING, REASONS, STALE_PERIODS
 from experiments.parallel.recording import Driven, Outcome, Recording
 from experiments.parallel.setup import Setup
+from experiments.run.metrics import rms
 from lpv_track_env.bicycle import PSI, VX, X, Y
 
 Array = NDArray[np.float64]
@@ -109,7 +109,7 @@ def faults(setup: Setup, outcome: Outcome) -> Summary:
 
 
 def tracking(driven: Driven) -> Summary:
-    """Errors of the true vehicle, as `experiments.metrics` defines them."""
+    """Errors of the true vehicle, as `experiments.run.metrics` defines them."""
     return {
         "mle": float(np.abs(driven.lateral_error).max()),
         "ale": rms(driven.time, driven.lateral_error),

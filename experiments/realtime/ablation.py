@@ -9,12 +9,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from experiments.benchmark import run_benchmark, selected, tell_failed
 from experiments.figures import COLOURS
 from experiments.realtime.axes import plain_ticks
-from experiments.results import revision, versions
-from experiments.suites import grid
-from experiments.tables import estimate
+from experiments.run.benchmark import run_benchmark, selected, tell_failed
+from experiments.run.store import revision, versions
+from experiments.run.suites import grid
+from experiments.run.tables import estimate
 from lpv_track_env.conditions import REALTIME
 from trajectories.atomic import write_atomically
 

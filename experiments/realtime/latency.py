@@ -20,16 +20,16 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from experiments.benchmark import run_benchmark, selected, tell_failed
-from experiments.cases import Case
-from experiments.computing import ARRANGEMENTS, ComputingTimes, quantiles
 from experiments.figures import COLOURS
 from experiments.realtime.axes import plain_ticks
-from experiments.results import revision, versions
-from experiments.rollout import rollout
-from experiments.suites import grid
-from experiments.tables import estimate
-from lpv_track_env.estimator import Estimator
+from experiments.run.benchmark import run_benchmark, selected, tell_failed
+from experiments.run.case import Case
+from experiments.run.computing import ARRANGEMENTS, ComputingTimes, quantiles
+from experiments.run.rollout import rollout
+from experiments.run.store import revision, versions
+from experiments.run.suites import grid
+from experiments.run.tables import estimate
+from lpv_track_env.estimation.estimator import Estimator
 from lpv_track_env.vehicle import VEHICLES
 from trajectories.atomic import write_atomically
 

@@ -21,8 +21,8 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
-from experiments.interrupts import Interrupts
-from experiments.results import hardware, revision, versions
+from experiments.run.interrupts import Interrupts
+from experiments.run.store import hardware, revision, versions
 from experiments.speed import (
     environments,
     learning,

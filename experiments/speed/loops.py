@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 import agents
-from agents.nmpc.closed_loop import ClosedLoop
+from agents.weight_tuning.closed_loop import ClosedLoop
 from agents.weight_tuning.vector_env import WeightTuningVectorEnv
 from experiments.speed import peers
 from experiments.speed.measure import Effort, Section, Tick, calibrated, interleave

@@ -5,9 +5,9 @@ from dataclasses import replace
 from typing import Any
 
 import agents
+from experiments.run.suites import LEARNED
 from experiments.speed import peers, solvers
 from experiments.speed.measure import PREDICT, Effort, Section, Tick
-from experiments.suites import LEARNED
 
 NMPC = "lpv-nmpc"
 

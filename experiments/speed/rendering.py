@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from experiments.agent_words import agent_notes, world_plan
-from experiments.cases import Case
-from experiments.rollout import steps
+from experiments.run.case import Case
+from experiments.run.rollout import steps
 from experiments.speed.measure import Effort, Section, Tick
 
 TRAJECTORY, AGENT = "T3", "lpv-nmpc"

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 import agents
 from agents.nmpc.problem import Status
+from experiments.run.suites import PAPER_VEHICLES
 from experiments.speed.measure import PREDICT, Effort, Section, Tick
-from experiments.suites import PAPER_VEHICLES
 from lpv_track_env.observation import SCALARS
 from lpv_track_env.registration import PATH_TRACKING
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from experiments.suites import HELD_OUT, SIX
+from experiments.run.suites import HELD_OUT, SIX
 from experiments.training.hyperparameters import ALGORITHMS, complete
 from lpv_track_env import conditions, vehicle
 from lpv_track_env.naming import choose

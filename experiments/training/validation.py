@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.cases import Case, run_case
+from experiments.run.case import Case, run_case
 from experiments.training.seeds import VALIDATION_EPISODES, validation_names
 from experiments.training.settings import TrainingSettings
 

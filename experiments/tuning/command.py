@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from experiments.benchmark import parse_settings, progress_bar
+from experiments.run.benchmark import parse_settings, progress_bar
 from experiments.tuning.settings import PPO_METHODS, TuningSettings, usual
 
 PLAIN = (

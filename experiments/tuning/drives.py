@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 import agents
 import trajectories
-from agents.nmpc.closed_loop import ClosedLoop
 from agents.weight_tuning.choice import DIRECTIONS, SLEW
+from agents.weight_tuning.closed_loop import ClosedLoop
 from agents.weight_tuning.score import scores_of
 from agents.weights import HIGHEST, LOWEST, TrackingWeights
 from experiments.training.seeds import TRAINING_EPISODES, TRAINING_PATHS, random_names

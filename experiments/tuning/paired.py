@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 import agents
-from agents.nmpc.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning import features
+from agents.weight_tuning.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import FAILED, SCALES, failed, rms_so_far, scores_of, squares_of

@@ -10,7 +10,7 @@ from typing import Any
 
 from agents.weight_tuning.choice import DIRECTIONS
 from agents.weight_tuning.views import VIEWS
-from experiments.suites import HELD_OUT, SIX
+from experiments.run.suites import HELD_OUT, SIX
 from experiments.training.hyperparameters import LEAST, MOST
 from experiments.training.settings import MOST_PATHS
 from lpv_track_env import conditions, vehicle

@@ -17,10 +17,10 @@ from rich.console import Console
 from rich.table import Table
 
 from agents.registry import agent_class
-from experiments import engines
-from experiments.benchmark import progress_bar
-from experiments.results import hardware, revision, versions
-from experiments.suites import PAPER_VEHICLES
+from experiments.run import engines
+from experiments.run.benchmark import progress_bar
+from experiments.run.store import hardware, revision, versions
+from experiments.run.suites import PAPER_VEHICLES
 from experiments.verify.bench import FATROP_EVERY, run_situation, situation_death
 from experiments.verify.situations import kind
 from experiments.verify.verdict import QUANTILES, number, shortfalls, summarise

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import DrivingTask
-from agents.nmpc.agent import IpoptNmpc
 from agents.nmpc.casadi_solver import CasadiSolver
+from agents.nmpc.ipopt_agent import IpoptNmpc
 from agents.reference import steady_turn
 from agents.weights import TrackingWeights
-from experiments.suites import PAPER_VEHICLES, SIX
+from experiments.run.suites import PAPER_VEHICLES, SIX
 from lpv_track_env.registration import PATH_TRACKING
 from trajectories import load
 

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lpv_track_env import conditions_episode, kernels
+from lpv_track_env import kernels
+from lpv_track_env.conditions import episode as conditions_episode
 from lpv_track_env.plants import Plant
 
 Array = NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""Classical controllers: pure pursuit, Stanley, LQR and PID."""

@@ -1,0 +1,203 @@
+"""Geometric steering: Stanley's front axle and pure pursuit's rear axle.
+
+Both laws were made for an axle on the path. Here the centre of gravity is to be on it, so each axle
+follows the track that it takes while the centre of gravity is on the path (`agents.reference`): a
+constant curve then leaves no error.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+from agents.base import DrivingTask, TrackingAgent
+from agents.classical.longitudinal import SpeedControl, SpeedMemory
+from agents.reference import (
+    early_turn,
+    lagged_sideslip,
+    local_reference,
+    mean_curvature,
+    point_at,
+    steady_turn,
+    transient_turn,
+)
+from lpv_track_env.observation import TrackingObservation
+
+
+@dataclass
+class StanleyMemory:
+    """What Stanley remembers of one vehicle."""
+
+    speed: SpeedMemory = field(default_factory=SpeedMemory)
+    sideslip: float = 0.0
+    """Nominal sideslip, rad."""
+    steering_angle: float | None = None
+    """The angle in force one period ago, rad."""
+
+
+class Stanley(TrackingAgent[StanleyMemory]):
+    """Stanley's steering law in its full form, for a centre of gravity on the path.
+
+    With errors positive to the left and angles counter-clockwise::
+
+        delta = delta_n - (e_psi + beta_n) - atan(k e_f / (k_soft + |vx|))
+                - k_yaw (r - r_n) - k_steer (delta_in_force - the one a period before)
+        e_f   = e_y + lf (sin(e_psi) + sin(beta_n))
+
+    Hoffmann, Tomlin, Montemerlo and Thrun, "Autonomous automobile trajectory tracking for off-road
+    driving", American Control Conference 2007. There the front axle is on the path: the path's
+    heading below it carries the curvature, and psi_ss, the front tyre's slip in a steady turn, the
+    understeer. Here both are in delta_n, the steering with the centre of gravity on the path;
+    beta_n and r_n are the sideslip and yaw rate that go with it, e_f is the front axle's distance
+    from its own track. A corner that no vehicle can drive is begun early (`early_turn`).
+
+    Parameters
+    ----------
+    task
+        What will be driven.
+    gain
+        k, 1/s.
+    softening_speed
+        k_soft, m/s: bounds the reaction to lateral errors at low speed.
+    yaw_damping
+        k_yaw, s.
+    steering_damping
+        k_steer, 1, below 1: on the steering angle's last change.
+    curvature_window
+        m ahead of the foot point over which the curvature is averaged.
+    early_turn_share
+        Share of the curvature at full lock with which undrivable corners are rounded.
+    """
+
+    def __init__(
+        self,
+        task: DrivingTask,
+        *,
+        gain: float = 1.5,
+        softening_speed: float = 1.0,
+        yaw_damping: float = 0.1,
+        steering_damping: float = 0.1,
+        curvature_window: float = 1.0,
+        early_turn_share: float = 0.6,
+    ) -> None:
+        super().__init__(task)
+        self.gain = gain
+        self.softening_speed = softening_speed
+        self.yaw_damping = yaw_damping
+        self.steering_damping = steering_damping
+        self.curvature_window = curvature_window
+        self.rounding = early_turn_share * task.vehicle.max_steering_angle / task.vehicle.wheelbase
+        self.speed_control = SpeedControl(task)
+
+    def new_memory(self) -> StanleyMemory:
+        """Memory of a vehicle that begins without sideslip."""
+        return StanleyMemory()
+
+    def control(
+        self, observation: TrackingObservation, memory: StanleyMemory
+    ) -> tuple[float, float]:
+        """Acceleration (m/s^2) and steering angle (rad) for one observation."""
+        vehicle, period = self.task.vehicle, self.task.control_period
+        reference = local_reference(observation, self.task.layout.preview_period)
+        vx, in_force = float(observation.longitudinal_speed), float(observation.steering_angle)
+
+        early = early_turn(reference, self.rounding)
+        curvature = early.curvature or mean_curvature(reference, 0.0, self.curvature_window)
+        turn = steady_turn(curvature, vx, vehicle)
+        nominal = transient_turn(turn, memory.sideslip, vx, vehicle)
+        memory.sideslip = lagged_sideslip(turn, memory.sideslip, vx * period, vehicle)
+        last = in_force if memory.steering_angle is None else memory.steering_angle
+        memory.steering_angle = in_force
+
+        heading_error = float(observation.heading_error) - early.heading  # e_psi
+        lateral_error = float(observation.lateral_error) - early.lateral_offset  # e_y
+        front_error = lateral_error + vehicle.front_axle_distance * (
+            math.sin(heading_error) + math.sin(nominal.sideslip)
+        )
+        steering = (
+            nominal.steering_angle
+            - (heading_error + nominal.sideslip)
+            - math.atan(self.gain * front_error / (self.softening_speed + abs(vx)))
+            - self.yaw_damping * (float(observation.yaw_rate) - nominal.yaw_rate)
+            - self.steering_damping * (in_force - last)
+        )
+        acceleration = self.speed_control.acceleration(
+            observation, reference, steering, memory.speed
+        )
+        return acceleration, steering
+
+
+class PurePursuit(TrackingAgent[SpeedMemory]):
+    """Pure pursuit: steer the rear axle on an arc to a point ahead.
+
+    ::
+
+        delta = (L + K vx^2) 2 sin(alpha) / d
+
+    with d the distance of the goal from the rear axle and alpha its bearing from the direction in
+    which this axle travels: the arc's curvature (Coulter, CMU-RI-TR-92-01, 1992), times what the
+    bicycle needs per curvature, L without slip and the understeer gradient K times vx^2 with it.
+    The goal lies where the rear axle will be when the centre of gravity is on the path, a lookahead
+    farther on: lr behind the path's point, turned by the sideslip there. The direction of travel is
+    the heading and the steady turn's slip at the rear axle, zero at low speed.
+
+    Parameters
+    ----------
+    task
+        What will be driven.
+    lookahead_time
+        s.
+    lookahead_wheelbases
+        The least lookahead, in wheelbases: the lookahead distance along the path is the larger one
+        of this and lookahead_time |vx|.
+    curvature_window
+        m ahead of the foot point over which the curvature for the rear slip is averaged.
+    """
+
+    def __init__(
+        self,
+        task: DrivingTask,
+        *,
+        lookahead_time: float = 0.8,
+        lookahead_wheelbases: float = 1.5,
+        curvature_window: float = 1.0,
+    ) -> None:
+        super().__init__(task)
+        self.lookahead_time = lookahead_time
+        self.curvature_window = curvature_window
+        self.minimum_lookahead = lookahead_wheelbases * task.vehicle.wheelbase
+        self.speed_control = SpeedControl(task)
+
+    def new_memory(self) -> SpeedMemory:
+        """Memory of the speed control: the steering remembers nothing."""
+        return SpeedMemory()
+
+    def control(self, observation: TrackingObservation, memory: SpeedMemory) -> tuple[float, float]:
+        """Acceleration (m/s^2) and steering angle (rad) for one observation."""
+        vehicle = self.task.vehicle
+        reference = local_reference(observation, self.task.layout.preview_period)
+        vx, heading_error = float(observation.longitudinal_speed), float(observation.heading_error)
+        lr = vehicle.rear_axle_distance
+        lookahead = max(self.minimum_lookahead, self.lookahead_time * abs(vx))
+
+        # The path goes on beyond the preview as in its last metres, as far as it could be driven.
+        end = float(reference.arc_length[-1])
+        limit = vehicle.max_steering_angle / vehicle.wheelbase
+        beyond = min(max(mean_curvature(reference, end - 2.0 * lr, end), -limit), limit)
+        point = point_at(reference, lookahead, beyond)
+        # The rear axle swings in over about lr, so the curvature before the goal decides.
+        before = mean_curvature(reference, lookahead - 2.0 * lr, lookahead)
+        goal_heading = point.heading - steady_turn(before, vx, vehicle).sideslip
+
+        goal_x = point.x - lr * math.cos(goal_heading)
+        goal_y = point.y - lr * math.sin(goal_heading)
+        ahead = goal_x + lr * math.cos(heading_error)
+        left = goal_y - (float(observation.lateral_error) - lr * math.sin(heading_error))
+        # A goal nearer than half the lookahead is one that the vehicle is not driving towards.
+        distance = max(math.hypot(ahead, left), 0.5 * lookahead)
+        # With slip, the rear axle travels beside the vehicle's heading.
+        here = steady_turn(mean_curvature(reference, 0.0, self.curvature_window), vx, vehicle)
+        travel = heading_error + here.rear_slip
+        across = left * math.cos(travel) - ahead * math.sin(travel)  # d sin(alpha)
+        curvature = 2.0 * across / distance**2
+        steering = curvature * (vehicle.wheelbase + vehicle.understeer_gradient * vx * vx)
+        acceleration = self.speed_control.acceleration(observation, reference, steering, memory)
+        return acceleration, steering

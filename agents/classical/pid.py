@@ -1,0 +1,147 @@
+"""PID steering on the lateral error at a point ahead, with curvature feedforward."""
+
+import math
+from dataclasses import dataclass, field
+
+from agents.base import DrivingTask, TrackingAgent
+from agents.classical.longitudinal import SpeedControl, SpeedMemory
+from agents.reference import (
+    early_turn,
+    lagged_sideslip,
+    local_reference,
+    mean_curvature,
+    steady_turn,
+    transient_turn,
+)
+from lpv_track_env.observation import TrackingObservation
+
+
+@dataclass
+class PidMemory:
+    """What the PID remembers of one vehicle."""
+
+    speed: SpeedMemory = field(default_factory=SpeedMemory)
+    sideslip: float = 0.0
+    """Nominal sideslip, rad."""
+    integral: float = 0.0
+    """m: the integral part, in units of the error."""
+    error: float | None = None
+    """m, of one period ago."""
+    error_rate: float = 0.0
+    """m/s, low-pass filtered."""
+
+
+class Pid(TrackingAgent[PidMemory]):
+    """PID steering, scheduled on the vehicle and its speed.
+
+    ::
+
+        e     = e_y + l sin(e_psi + beta_n),    l = lookahead_wheelbases L + lookahead_time |vx|
+        delta = delta_n - (L + K vx^2) (2 zeta/l)^2 (e + int e dt / T_i + T_d e')
+
+    e is the lateral error at a point l ahead of the centre of gravity, for a vehicle on the path
+    zero also in a curve; delta_n and beta_n are the steering and sideslip that keep the centre of
+    gravity on the path (`agents.reference.transient_turn`). (L + K vx^2) is the steering per
+    curvature, so over the distance driven e_y'' + (2 zeta/l)^2 (e_y + l e_y') = 0: critically
+    damped at zeta 1, at every speed and for every vehicle. The integral holds still while the
+    steering is at its range or rate limit and would be driven further into it.
+
+    Parameters
+    ----------
+    task
+        What will be driven.
+    lookahead_time
+        s.
+    lookahead_wheelbases
+        Lookahead at standstill, in wheelbases.
+    damping
+        zeta, dimensionless.
+    integral_time, derivative_time
+        T_i and T_d, s.
+    filter_time
+        s, of the derivative's low-pass filter.
+    approach_angle
+        rad: e_y is limited to approach_angle l, so from far away the vehicle heads for the path at
+        this angle and no steeper.
+    curvature_window
+        m ahead of the foot point over which the curvature is averaged.
+    early_turn_share
+        Share of the curvature at full lock with which undrivable corners are rounded.
+    """
+
+    def __init__(
+        self,
+        task: DrivingTask,
+        *,
+        lookahead_time: float = 0.8,
+        lookahead_wheelbases: float = 1.0,
+        damping: float = 0.9,
+        integral_time: float = 4.0,
+        derivative_time: float = 0.1,
+        filter_time: float = 0.05,
+        approach_angle: float = 0.5,
+        curvature_window: float = 1.0,
+        early_turn_share: float = 0.6,
+    ) -> None:
+        super().__init__(task)
+        self.lookahead_time = lookahead_time
+        self.shortest_lookahead = lookahead_wheelbases * task.vehicle.wheelbase
+        self.damping = damping
+        self.integral_time = integral_time
+        self.derivative_time = derivative_time
+        self.filter_time = filter_time
+        self.approach_angle = approach_angle
+        self.curvature_window = curvature_window
+        self.rounding = early_turn_share * task.vehicle.max_steering_angle / task.vehicle.wheelbase
+        self.speed_control = SpeedControl(task)
+
+    def new_memory(self) -> PidMemory:
+        """Memory of a vehicle that begins without sideslip, its integrators empty."""
+        return PidMemory()
+
+    def control(self, observation: TrackingObservation, memory: PidMemory) -> tuple[float, float]:
+        """Acceleration (m/s^2) and steering angle (rad) for one observation."""
+        vehicle, period = self.task.vehicle, self.task.control_period
+        reference = local_reference(observation, self.task.layout.preview_period)
+        vx = float(observation.longitudinal_speed)
+
+        early = early_turn(reference, self.rounding)
+        curvature = early.curvature or mean_curvature(reference, 0.0, self.curvature_window)
+        turn = steady_turn(curvature, vx, vehicle)
+        nominal = transient_turn(turn, memory.sideslip, vx, vehicle)
+        memory.sideslip = lagged_sideslip(turn, memory.sideslip, vx * period, vehicle)
+
+        lookahead = self.shortest_lookahead + self.lookahead_time * abs(vx)
+        heading_error = float(observation.heading_error) - early.heading
+        lateral_error = float(observation.lateral_error) - early.lateral_offset
+        farthest = self.approach_angle * lookahead
+        error = min(max(lateral_error, -farthest), farthest)
+        error += lookahead * math.sin(heading_error + nominal.sideslip)
+        if memory.error is not None:
+            share = period / (self.filter_time + period)
+            rate = (error - memory.error) / period
+            memory.error_rate += share * (rate - memory.error_rate)
+        memory.error = error
+
+        per_curvature = vehicle.wheelbase + vehicle.understeer_gradient * vx * vx
+        gain = per_curvature * (2.0 * self.damping / lookahead) ** 2
+        steering = nominal.steering_angle - gain * (
+            error + memory.integral + self.derivative_time * memory.error_rate
+        )
+        self._integrate(observation, steering, error, memory)
+        acceleration = self.speed_control.acceleration(
+            observation, reference, steering, memory.speed
+        )
+        return acceleration, steering
+
+    def _integrate(
+        self, observation: TrackingObservation, steering: float, error: float, memory: PidMemory
+    ) -> None:
+        """Integrate the error, unless the steering is limited and the error would push it on."""
+        vehicle, period = self.task.vehicle, self.task.control_period
+        in_force, reach = float(observation.steering_angle), vehicle.max_steering_rate * period
+        actual = min(max(steering, in_force - reach), in_force + reach)
+        actual = min(max(actual, -vehicle.max_steering_angle), vehicle.max_steering_angle)
+        # A positive error steers to negative angles.
+        if (actual - steering) * error <= 0.0:
+            memory.integral += error * period / self.integral_time

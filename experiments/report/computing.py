@@ -1,0 +1,116 @@
+"""Section on computing: how long calls of `predict` took, against the control period."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.report.charts import Chart
+from experiments.report.document import Document, first_open, joined, paragraph
+from experiments.report.drives import Drive, by_setting, family_of
+from experiments.report.html_tables import html_table
+from experiments.report.path_figures import Panel
+from experiments.report.scales import Scale, decades
+from experiments.report.styles import Styles, legend
+
+Array = NDArray[np.float64]
+
+RAREST = 1e-4
+"""Least share of calls that is drawn."""
+PERIOD = 0.05
+HEADINGS = (
+    "agent", "calls", "median, ms", "95 %, ms", "99 %, ms", "longest, ms", "control period, ms",
+    "longer than the period, %",
+)  # fmt: skip
+NOTE = (
+    "Whole calls of predict, on the machine of the manifest with all its workers busy. Calls of "
+    "the drives that are drawn (of several seeds the first); the first call of an episode counts "
+    "like any other."
+)
+
+
+def calls_of(drives: Iterable[Drive]) -> dict[str, Array]:
+    """Times (s) of all calls of each agent; periods in which it was still busy are none."""
+    found: dict[str, list[Array]] = {}
+    for drive in drives:
+        seconds = drive.trace["solve_time"][1:]
+        found.setdefault(drive.label, []).append(seconds[seconds > 0.0])
+    return {label: calls for label, every in found.items() if (calls := np.concatenate(every)).size}
+
+
+def computing_section(document: Document, drives: Sequence[Drive], styles: Styles) -> str:
+    """Distribution of the calls' times, and how many were longer than the control period."""
+    groups = {
+        setting: (group, calls)
+        for setting, group in by_setting(drives).items()
+        if (calls := calls_of(group))
+    }
+    if not groups:
+        return ""
+    family = family_of(drives[0].case)
+    own = [setting for setting, (group, _) in groups.items() if family_of(group[0].case) == family]
+    drawn = own or list(groups)[:1]
+    panels = [
+        Panel(setting, _exceedance(groups[setting][1], styles, _period(groups[setting][0])))
+        for setting in drawn
+    ]
+    shown = {label for setting in drawn for label in groups[setting][1]}
+    figure = document.figure(
+        "Share of calls of predict that took longer than a time. Both axes are logarithmic: a line "
+        "crosses 0.5 at the median and 0.01 at the 99th percentile. Dashed in red: the control "
+        "period, which is the deadline.",
+        panels, legend(styles, shown), wide=True,
+    )  # fmt: skip
+    told = [
+        (
+            setting in drawn,
+            document.table(
+                f"Times of predict, and the share of calls that missed the deadline, {setting}.",
+                html_table(
+                    HEADINGS,
+                    [_line(label, own, _period(group)) for label, own in calls.items()],
+                    range(1, len(HEADINGS)),
+                ),
+            ),
+        )
+        for setting, (group, calls) in groups.items()
+    ]
+    return joined([paragraph(NOTE), figure, first_open(told, "Other settings")])
+
+
+def _period(drives: Iterable[Drive]) -> float:
+    return min(float(drive.case.get("control_period", PERIOD)) for drive in drives)
+
+
+def _exceedance(calls: Mapping[str, Array], styles: Styles, period: float) -> str:
+    every = [np.array([one.min(), one.max(), period]) for one in calls.values()]
+    chart = Chart(
+        decades([1e3 * one for one in every], 1e-4),
+        Scale(RAREST, 1.15, log=True),
+        x_label="time t (ms)", y_label="share of calls longer than t", height=230.0,
+    )  # fmt: skip
+    for label in styles:
+        if label not in calls:
+            continue
+        ordered = np.sort(calls[label])
+        longer = 1.0 - np.arange(1, len(ordered) + 1) / len(ordered)
+        # Evenly over the logarithm of the share: the tail counts as much as the middle.
+        wanted = np.geomspace(1.0, RAREST, 160)
+        kept = np.unique(np.searchsorted(-longer, -wanted).clip(0, len(ordered) - 1))
+        style = styles[label]
+        chart.line(
+            1e3 * ordered[kept], np.maximum(longer[kept], 0.5 * RAREST), style.kind, style.width
+        )
+    chart.rule(x=1e3 * period)
+    chart.note(f"{1e3 * period:g} ms ", 1e3 * period, 0.72, "limit", "end")
+    return chart.svg()
+
+
+def _line(label: str, calls: Array, period: float) -> list[str]:
+    median, high, rare = 1e3 * np.percentile(calls, (50, 95, 99))
+    late = int((calls > period).sum())
+    share = f"{100 * late / len(calls):.3f}" if late else "0"
+    return [
+        label, f"{len(calls):,}", f"{median:.3f}", f"{high:.3f}", f"{rare:.3f}",
+        f"{1e3 * calls.max():.2f}", f"{1e3 * period:g}", share,
+    ]  # fmt: skip

@@ -1,0 +1,1 @@
+"""Robustness of closed loops against switching weights."""

@@ -1,0 +1,1 @@
+"""Cases, their rollouts, metrics and result folders."""

@@ -1,0 +1,178 @@
+"""`lpv-track benchmark`: run cases, keep them, print the table, write the report."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from experiments.report.build import where, write_report
+from experiments.run import engines
+from experiments.run.case import Case
+from experiments.run.console_tables import console_table
+from experiments.run.interrupts import Interrupts
+from experiments.run.store import ResultStore
+
+Spec = Mapping[str, Any]
+
+
+def distinct(specs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The same cases, each once."""
+    return list({Case(**spec).id: spec for spec in specs}.values())
+
+
+def check(specs: Sequence[Spec]) -> None:
+    """Refuse unknown names and settings before anything runs.
+
+    Raises
+    ------
+    ValueError
+        Listing the known names and the nearest.
+    """
+    for spec in specs:
+        Case(**spec).check()
+
+
+def run_benchmark(
+    specs: Sequence[Spec],
+    folder: Path,
+    *,
+    workers: int,
+    settings: Mapping[str, Any],
+    resume: bool = True,
+    console: Console,
+) -> ResultStore:
+    """Run what is not yet in the folder, one fsynced line a case, with a progress bar.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name, no workers, or a folder that holds results while `resume` is off.
+    """
+    if workers < 1:
+        raise ValueError(f"workers must be at least 1, not {workers}")
+    check(specs)
+    store = ResultStore(folder)
+    known = {case["id"] for case in store.cases() if case["status"] == "ok"}
+    if store.cases() and not resume:
+        raise ValueError(f"{folder} holds results already: say --resume, or give another --out")
+    missing = [spec for spec in specs if Case(**spec).id not in known]
+    store.write_manifest({**settings, "cases": [Case(**spec).id for spec in specs]})
+    if len(missing) < len(specs):
+        console.print(
+            f"{len(specs) - len(missing)} of {len(specs)} cases are in {folder} already "
+            "(same sources, same settings)"
+        )
+    if missing:
+        _run(missing, store, workers, console)
+    return store
+
+
+def progress_bar(console: Console) -> Progress:
+    """Bar with counts and times; nothing where the console is no terminal."""
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+def _run(specs: Sequence[Spec], store: ResultStore, workers: int, console: Console) -> None:
+    workers = min(workers, len(specs))
+    progress = progress_bar(console)
+    began = time.perf_counter()
+    with progress, Interrupts() as interrupts:
+        bar = progress.add_task("cases", total=len(specs))
+
+        def started(spec: Spec) -> None:
+            progress.update(bar, description=label(spec))
+
+        run = (
+            engines.in_process(specs, started=started)
+            if workers == 1
+            else engines.local_pool(specs, workers, started=started)
+        )
+        for count, result in enumerate(run, start=1):
+            # First, for a case may have taken it for a failed solve.
+            interrupts.check()
+            store.append(result)
+            progress.advance(bar)
+            if not console.is_terminal:
+                elapsed = time.perf_counter() - began
+                console.print(
+                    f"[{count}/{len(specs)}, {elapsed:.0f} s] {label(result)}: "
+                    f"{result['end'] or result.get('error')}",
+                    markup=False, highlight=False,
+                )  # fmt: skip
+
+
+def label(spec: Spec) -> str:
+    """Short name of a case for a line of progress."""
+    return f"{spec['agent']} {spec['trajectory']} {spec['vehicle']} {spec['speed_mode']}"
+
+
+def selected(store: ResultStore, specs: Sequence[Spec]) -> list[dict[str, Any]]:
+    """Results of some specs, in their order."""
+    by_id = {case["id"]: case for case in store.cases()}
+    return [by_id[key] for spec in specs if (key := Case(**spec).id) in by_id]
+
+
+def finish(store: ResultStore, specs: Sequence[Spec], console: Console) -> int:
+    """Print the table, write the report, say where; 1 if a case failed, else 0."""
+    cases = selected(store, specs)
+    console.print(console_table(cases))
+    report = write_report(store.folder)
+    failed = tell_failed(cases, console)
+    console.print(where(report), markup=False, highlight=False, soft_wrap=True)
+    return 1 if failed else 0
+
+
+def tell_failed(cases: Sequence[Mapping[str, Any]], console: Console) -> int:
+    """Print a line for each case that failed; how many did."""
+    failed = [case for case in cases if case["status"] != "ok"]
+    for case in failed:
+        console.print(f"failed: {label(case)}: {case['error']}", markup=False, style="red")
+    return len(failed)
+
+
+def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
+    """Read KEY=VALUE pairs; values are JSON where they parse as such, text otherwise.
+
+    Raises
+    ------
+    ValueError
+        For a pair without "=", or a number that is not finite.
+    """
+
+    def refuse(constant: str) -> NoReturn:
+        raise OverflowError(constant)
+
+    settings: dict[str, Any] = {}
+    for pair in pairs:
+        key, separator, value = pair.partition("=")
+        if not separator or not key:
+            raise ValueError(f"{pair!r} is not KEY=VALUE")
+        try:
+            settings[key] = json.loads(value, parse_constant=refuse)
+        except OverflowError:
+            raise ValueError(f"{pair}: numbers must be finite") from None
+        except ValueError:
+            settings[key] = value
+    return settings

@@ -1,0 +1,146 @@
+"""Where cases run: in this process, or over a pool of local worker processes.
+
+A worker that dies takes its pool with it. The pool is rebuilt and the cases that were in flight are
+run alone, one by one; one that kills its worker again is marked failed and the sweep goes on.
+"""
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait as wait_for
+from typing import Any
+
+from experiments.run.case import Case, run_case
+
+Result = dict[str, Any]
+Spec = Mapping[str, Any]
+Run = Callable[[Spec], Result]
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def one_thread() -> None:
+    """One thread a process, for this one's children too; before numerical libraries load."""
+    for variable in THREAD_VARIABLES:
+        os.environ.setdefault(variable, "1")
+
+
+def in_process(
+    specs: Sequence[Spec], run: Run = run_case, started: Callable[[Spec], None] | None = None
+) -> Iterator[Result]:
+    """Run cases one after another here."""
+    for spec in specs:
+        if started is not None:
+            started(spec)
+        yield run(spec)
+
+
+def worker_death(spec: Spec) -> Result:
+    """Result of a case that killed its worker twice."""
+    case = Case(**spec)
+    return {
+        "id": case.id,
+        **case.as_dict(),
+        "status": "failed",
+        "end": None,
+        "error": "the worker process died, twice",
+        "metrics": {},
+        "solver": {},
+        "warnings": [],
+        "seconds": 0.0,
+        "trace": {},
+    }
+
+
+def local_pool(
+    specs: Sequence[Spec],
+    workers: int,
+    run: Run = run_case,
+    started: Callable[[Spec], None] | None = None,
+    died: Run = worker_death,
+) -> Iterator[Result]:
+    """Run cases over `workers` processes and yield results as they end.
+
+    `died` makes the result of a case that killed its worker twice.
+
+    Raises
+    ------
+    ValueError
+        If there is not at least one worker.
+    """
+    if workers < 1:
+        raise ValueError(f"workers must be at least 1, not {workers}")
+    one_thread()
+    waiting = list(specs)
+    suspects: list[Spec] = []
+    while waiting or suspects:
+        alone = not waiting
+        batch, waiting = (suspects[:1], []) if alone else (waiting, [])
+        suspects = suspects[1:] if alone else suspects
+        unfinished = yield from _pool(batch, 1 if alone else workers, run, started)
+        if unfinished is None:
+            continue
+        running, waiting = unfinished
+        if alone and running:
+            yield died(running[0])
+        else:
+            suspects += running
+
+
+def _begin_worker() -> None:
+    """Leave Ctrl-C to the parent, and end with it even if it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        wait_for([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+def _pool(
+    specs: Sequence[Spec], workers: int, run: Run, started: Callable[[Spec], None] | None
+) -> Generator[Result, None, tuple[list[Spec], list[Spec]] | None]:
+    """Run cases in one pool; return (those in flight, those not begun) if it breaks, else None."""
+    context = multiprocessing.get_context("spawn")
+    queue = list(specs)
+    running: dict[Future[Result], Spec] = {}
+    unfinished = None
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker)
+    try:
+        while queue or running:
+            while queue and len(running) < workers:
+                try:
+                    future = pool.submit(run, queue[0])
+                except BrokenProcessPool:
+                    break
+                running[future] = spec = queue.pop(0)
+                if started is not None:
+                    started(spec)
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            # Of a pool that broke, what had ended before is still to be read.
+            ended = [future for future in done if not _broken(future)]
+            for future in ended:
+                running.pop(future)
+                yield future.result()
+            if not ended:
+                unfinished = list(running.values()), queue
+                break
+    except BaseException:
+        # Interrupted, or the consumer stopped: do not wait for cases nobody will read.
+        for process in list((getattr(pool, "_processes", None) or {}).values()):
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    return unfinished
+
+
+def _broken(future: Future[Result]) -> bool:
+    return isinstance(future.exception(), BrokenProcessPool)

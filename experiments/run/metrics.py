@@ -1,0 +1,161 @@
+"""Metrics of an episode: the paper's, by its formulas, and what they leave out.
+
+e_d is the lateral error (left positive), e_th the heading error in (-pi, pi]; T the episode's
+duration (kumar2025lpv, section V)::
+
+    MLE = max |e_d|                 ALE = sqrt(1/T int e_d^2 dt)
+    MOE = max |e_th|                AOE = sqrt(1/T int e_th^2 dt)
+    CTE = (x_v - x_r) sin(th_r) - (y_v - y_r) cos(th_r)
+
+ALE and AOE are root mean squares, whatever their name says. With the reference point (x_r, y_r) at
+the foot of the perpendicular, |CTE| is |e_d|, so Max CTE equals MLE and Mean CTE never exceeds ALE.
+The published tables have Mean CTE above ALE; their reference point must be another one, for example
+where the reference would be by the clock. That distance is given separately.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.run.band_metrics import by_band
+from experiments.run.rollout import Trace
+from lpv_track_env.bicycle import VX, VY, X, Y, derivative
+from lpv_track_env.vehicle import VehicleParameters
+from trajectories import ReferencePath
+
+Array = NDArray[np.float64]
+
+
+def rms(time: Array, values: Array) -> float:
+    """sqrt(1/T int values^2 dt) by the trapezoidal rule; 0 for an episode of no duration."""
+    duration = time[-1] - time[0]
+    if duration <= 0:
+        return 0.0
+    return float(np.sqrt(np.trapezoid(values**2, time) / duration))
+
+
+def cross_track_error(trace: Trace, path: ReferencePath) -> Array:
+    """CTE by the paper's formula, with the foot point as reference point, (n + 1,) m."""
+    foot = path.sample(trace.arc_length)
+    dx, dy = trace.state[:, X] - foot.x, trace.state[:, Y] - foot.y
+    return dx * np.sin(foot.heading) - dy * np.cos(foot.heading)
+
+
+def time_indexed_distance(trace: Trace, path: ReferencePath) -> Array:
+    """Distance to where the reference, started with the episode, is by the clock, (n + 1,) m."""
+    start = path.sample(trace.arc_length[0]).time
+    clock = path.arc_length_at(trace.time + float(start))
+    there = path.sample(np.minimum(clock, path.length) if not path.closed else clock)
+    return np.hypot(trace.state[:, X] - there.x, trace.state[:, Y] - there.y)
+
+
+def tracking(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
+    """The paper's six metrics, and errors of speed and against the clock."""
+    del vehicle
+    cte = np.abs(cross_track_error(trace, path))
+    clock = time_indexed_distance(trace, path)
+    speed_error = trace.state[:, VX] - trace.reference_speed
+    return {
+        "max_cte": float(cte.max()),
+        "mean_cte": float(cte.mean()),
+        "mle": float(np.abs(trace.lateral_error).max()),
+        "ale": rms(trace.time, trace.lateral_error),
+        "moe": float(np.abs(trace.heading_error).max()),
+        "aoe": rms(trace.time, trace.heading_error),
+        "mean_abs_lateral_error": float(np.abs(trace.lateral_error).mean()),
+        "max_time_indexed_distance": float(clock.max()),
+        "mean_time_indexed_distance": float(clock.mean()),
+        "max_speed_error": float(np.abs(speed_error).max()),
+        "rms_speed_error": rms(trace.time, speed_error),
+    }
+
+
+def activity(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
+    """How much the actuators work: total variation, and the rms of their rates."""
+    del path, vehicle
+    dt = np.diff(trace.time)
+    steering = np.diff(trace.steering_angle)
+    acceleration = np.diff(trace.acceleration)
+    # The first entry is what was in force before the first command.
+    return {
+        "steering_variation": float(np.abs(steering).sum()),
+        "acceleration_variation": float(np.abs(acceleration).sum()),
+        "steering_rate_rms": float(np.sqrt(np.mean((steering / dt) ** 2))) if dt.size else 0.0,
+        "jerk_rms": float(np.sqrt(np.mean((acceleration / dt) ** 2))) if dt.size else 0.0,
+        "clipped_share": float(np.mean(trace.clipped[1:] != 0)) if dt.size else 0.0,
+    }
+
+
+def violations(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
+    """By how much the paper's constraints were broken by what was driven: largest excess, share.
+
+    Each constraint gives `excess_NAME` (its own unit, 0 if kept) and `violated_NAME`, the share of
+    control periods in which it was broken by more than 1e-3 of its unit. Accelerations dvx/dt are
+    the vector field's at the state a period begins with, under the input held over it.
+    """
+    del path
+    vx, vy = trace.state[:, VX], trace.state[:, VY]
+    low, high = vehicle.speed_range
+    dv_low, dv_high = vehicle.longitudinal_acceleration_range
+    dt = np.diff(trace.time)
+    inputs = np.vstack([trace.acceleration[1:], trace.steering_angle[1:]])
+    rate = derivative(trace.state[:-1].T, inputs, vehicle)[VX]
+    excesses = {
+        "speed": np.maximum(low - vx, vx - high),
+        "lateral_velocity": np.abs(vy) - vehicle.max_lateral_velocity_ratio * vx,
+        "longitudinal_acceleration": np.maximum(dv_low - rate, rate - dv_high),
+        "steering_angle": np.abs(trace.steering_angle) - vehicle.max_steering_angle,
+        "steering_rate": np.abs(np.diff(trace.steering_angle)) / dt - vehicle.max_steering_rate,
+        "jerk": np.abs(np.diff(trace.acceleration)) / dt - vehicle.max_jerk,
+    }
+    result = {}
+    for name, excess in excesses.items():
+        result[f"excess_{name}"] = float(max(excess.max(initial=0.0), 0.0))
+        result[f"violated_{name}"] = float(np.mean(excess > 1e-3)) if excess.size else 0.0
+    return result
+
+
+def knowledge(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
+    """How well the estimate knew the vehicle, and how often commands or fixes failed to come.
+
+    All zero under ideal conditions. The lateral error of the estimate is across the path.
+    """
+    del vehicle
+    foot = path.sample(trace.arc_length)
+    dx, dy = (trace.estimate[:, k] - trace.state[:, k] for k in (X, Y))
+    distance = np.hypot(dx, dy)
+    across = dy * np.cos(foot.heading) - dx * np.sin(foot.heading)
+    return {
+        "rms_estimate_error": rms(trace.time, distance),
+        "max_estimate_error": float(distance.max()),
+        "rms_lateral_estimate_error": rms(trace.time, across),
+        "stopping_share": float(np.mean(trace.stopping[1:])) if trace.time.size > 1 else 0.0,
+        "deadline_misses": float(trace.deadline_misses[-1]),
+    }
+
+
+METRICS: tuple[Callable[[Trace, ReferencePath, VehicleParameters], dict[str, float]], ...] = (
+    tracking,
+    by_band,
+    activity,
+    violations,
+    knowledge,
+)
+"""Every function's entries go into a case's `metrics`; add your own here."""
+
+
+def evaluate(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
+    """All metrics of an episode."""
+    values: dict[str, float] = {}
+    for metric in METRICS:
+        values |= metric(trace, path, vehicle)
+    covered = trace.arc_length[-1] - trace.arc_length[0]
+    # A closed path is driven for one lap from wherever the episode began.
+    distance = path.length if path.closed else path.length - trace.arc_length[0]
+    return {
+        **values,
+        "reward": float(trace.reward.sum()),
+        "duration": float(trace.time[-1]),
+        "completed": float(np.clip(covered / max(distance, 1e-9), 0, 1)),
+    }

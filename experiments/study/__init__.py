@@ -1,0 +1,1 @@
+"""The tuning study: rungs, oracles, evaluation and report."""

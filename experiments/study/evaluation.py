@@ -1,0 +1,187 @@
+"""Weights judged on paths that nothing was tuned on: whole drives in compiled closed loops.
+
+Bit for bit what `lpv-track benchmark` drives with `lpv-nmpc-tuned`, but for the drives' batches.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import agents
+from agents.weight_tuning.closed_loop import ClosedLoop, Tally
+from agents.weight_tuning.deciding import Decider
+from agents.weight_tuning.policy import WeightPolicy
+from agents.weight_tuning.score import PARTS, SCALES, failed, parts_of, scores_of
+from experiments.run.band_metrics import BANDS
+from experiments.run.suites import HELD_OUT, RAW, RAW_PREVIEW, SIX
+from experiments.tuning.drives import threads
+from experiments.tuning.tuner import Result
+from lpv_track_env import kernels as k
+from lpv_track_env.bicycle import VX, VY
+from lpv_track_env.env import PathTrackingEnv
+from lpv_track_env.vector_env import PathTrackingVectorEnv
+from trajectories import ReferencePath
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class EvaluationSet:
+    """Paths and conditions to judge weights on, each path driven once a seed.
+
+    Seeds count from 0: no tuning, training or validation draws from them.
+    """
+
+    name: str
+    trajectories: tuple[str | ReferencePath, ...]
+    conditions: Any = "randomised"
+    seeds: int = 8
+    vehicle: str = "m2-minibus"
+    env_settings: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the paths."""
+        return tuple(
+            path.name if isinstance(path, ReferencePath) else path for path in self.trajectories
+        )
+
+
+def usual_sets(seeds: int) -> list[EvaluationSet]:
+    """Held-out random paths, also with less to hinder, the paper's six, and their raw waypoints."""
+    return [
+        EvaluationSet("held-out", HELD_OUT, seeds=seeds),
+        EvaluationSet("held-out, simulation", HELD_OUT, "simulation", 1),
+        # Whatever weights are, no controller knows its state better than this.
+        EvaluationSet(
+            "held-out, perfect sensors",
+            HELD_OUT,
+            {"name": "randomised", "estimator": "truth"},
+            min(seeds, 2),
+        ),
+        EvaluationSet("six, realtime", SIX, "realtime", seeds),
+        EvaluationSet("six, simulation", SIX, "simulation", 1),
+        EvaluationSet("raw waypoints, realtime", RAW, "realtime", seeds, env_settings=RAW_PREVIEW),
+    ]
+
+
+IN_BANDS = tuple(f"in_{name}" for name in BANDS.names)
+FIGURES = (
+    *PARTS, "score", "max_cte", "ale", "aoe", "failed", "violated", "clipped", "failures",
+    *IN_BANDS,
+)  # fmt: skip
+"""Of every drive: parts of the score and the score; the largest lateral error (m), its rms (m), the
+heading error's (rad); whether it failed; shares of periods in which |vy| / vx or the steering's or
+jerk's limit was broken, and in which an actuator clipped its command; failed solves; the score of
+the periods in each band of |curvature| at the foot point alone, NaN where there is none."""
+
+
+class Judge:
+    """Drives of an evaluation set, made once for many weights.
+
+    Parameters
+    ----------
+    given
+        What to drive.
+    """
+
+    def __init__(self, given: EvaluationSet) -> None:
+        self.given = given
+        settings: dict[str, Any] = {
+            "conditions": given.conditions, "autoreset_mode": "Disabled", **given.env_settings,
+        }  # fmt: skip
+        self.drives = [
+            PathTrackingVectorEnv(given.seeds, path, given.vehicle, **settings)
+            for path in given.trajectories
+        ]
+
+    def judge(self, result: Result, *, by_path: bool = False) -> dict[str, Array]:
+        """Figures of every drive, (paths, seeds) each, by the names in `FIGURES`.
+
+        Parameters
+        ----------
+        result
+            A schedule or a policy.
+        by_path
+            Whether a schedule's set is chosen once, by the path's sharpest curvature.
+        """
+        rows = [self._drive(envs, result, by_path) for envs in self.drives]
+        return {name: np.stack([row[name] for row in rows]) for name in FIGURES}
+
+    def _drive(
+        self, envs: PathTrackingVectorEnv, result: Result, by_path: bool
+    ) -> dict[str, Array]:
+        loop = loop_with(result, envs, by_path=by_path)
+        loop.reset(seed=0)
+        limit = envs.single.task.max_steps
+        trace = np.full((envs.num_envs, limit, k.MEMORY_SIZE), np.nan)
+        before = envs.memories.copy()
+        tally = loop.drive(limit, trace=trace)
+        trace = np.concatenate([before[:, None], trace], axis=1)
+        path = envs.single.task.path
+        return {**figures_of(tally, envs, trace), **band_scores(trace, path, envs.single)}
+
+
+def loop_with(result: Result, envs: PathTrackingVectorEnv, *, by_path: bool = False) -> ClosedLoop:
+    """Closed loop of environments in which a schedule or a policy chooses the weights."""
+    settings: dict[str, Any] = {}
+    decider = None
+    if isinstance(result, WeightPolicy):
+        decider = Decider(result.choice, result.layers, envs.single.control_period)
+    else:
+        settings = {"weights": result, "selection": "path" if by_path else "band"}
+    agent: Any = agents.make("lpv-nmpc", envs.single, **settings)
+    return ClosedLoop(envs, agent, decider=decider, threads=min(threads(), envs.num_envs))
+
+
+def figures_of(tally: Tally, envs: PathTrackingVectorEnv, trace: Array) -> dict[str, Array]:
+    """Figures of drives that have ended, (n,) each; `trace` (n, 1 + periods, MEMORY_SIZE)."""
+    ends, car, period = envs.arrays.ends, envs.single.vehicle, envs.single.control_period
+    parts, steps = parts_of(tally), np.maximum(tally.steps, 1.0)
+    driven = np.isfinite(trace[:, 1:, 0])
+    vx, vy = trace[:, 1:, VX], trace[:, 1:, VY]
+    steering, jerk = (
+        np.abs(np.diff(trace[:, :, entry], axis=1)) / period
+        for entry in (k.STEERING, k.ACCELERATION)
+    )
+    broken = (
+        (np.abs(vy) - car.max_lateral_velocity_ratio * vx > KEPT)
+        | (steering - car.max_steering_rate > KEPT)
+        | (jerk - car.max_jerk > KEPT)
+    )
+    return {
+        **dict(zip(PARTS, parts.T, strict=True)),
+        "score": scores_of(tally, ends),
+        "max_cte": tally.max_lateral,
+        "ale": np.sqrt(tally.lateral_square / steps),
+        "aoe": np.sqrt(tally.heading_square / steps),
+        "failed": failed(ends).astype(np.float64),
+        "violated": (broken & driven).sum(axis=1) / steps,
+        "clipped": tally.clipped / steps,
+        "failures": tally.failures,
+    }
+
+
+def band_scores(trace: Array, path: ReferencePath, env: PathTrackingEnv) -> dict[str, Array]:
+    """Scores of drives by what happened in each band, (n,) each; `trace` as in `figures_of`."""
+    after = trace[:, 1:]
+    rates = np.diff(trace[:, :, [k.STEERING, k.ACCELERATION]], axis=1) / env.control_period
+    errors = after[:, :, [k.LATERAL_ERROR, k.HEADING_ERROR, k.SPEED_ERROR]]
+    squares = (np.concatenate([errors, rates], axis=2) / SCALES) ** 2
+    driven = np.isfinite(after[:, :, 0])
+    place = np.where(driven, after[:, :, k.ARC_LENGTH], 0.0)
+    bands = BANDS.classify(path.sample(place).curvature)
+    found = {}
+    for index, name in enumerate(IN_BANDS):
+        here = driven & (bands == index)
+        count = here.sum(axis=1)
+        sums = np.where(here[:, :, None], squares, 0.0).sum(axis=1)
+        parts = np.sqrt(sums / np.maximum(count, 1)[:, None])
+        found[name] = np.where(count > 0, parts.sum(axis=1), np.nan)
+    return found
+
+
+KEPT = 1e-3
+"""A constraint broken by no more than this counts as kept, as in `experiments.run.metrics`."""

@@ -1,0 +1,41 @@
+"""Conditions of a drive: their fields and presets, and the compiled kernels that apply them."""
+
+from lpv_track_env.conditions.spec import (
+    DELAYS,
+    DRAWN,
+    ESTIMATORS,
+    FACTORS,
+    IDEAL,
+    LONGEST_DELAY,
+    PRESETS,
+    RANDOMISED,
+    REALTIME,
+    SIGNED,
+    SIMULATION,
+    USUAL_SPEED,
+    WIND_LEVER,
+    Actuation,
+    Conditions,
+    Range,
+    load,
+)
+
+__all__ = [
+    "DELAYS",
+    "DRAWN",
+    "ESTIMATORS",
+    "FACTORS",
+    "IDEAL",
+    "LONGEST_DELAY",
+    "PRESETS",
+    "RANDOMISED",
+    "REALTIME",
+    "SIGNED",
+    "SIMULATION",
+    "USUAL_SPEED",
+    "WIND_LEVER",
+    "Actuation",
+    "Conditions",
+    "Range",
+    "load",
+]

@@ -1,0 +1,209 @@
+"""Compiled kernels of path tracking under conditions: one vehicle's period, beginnings, many.
+
+What an agent sees is made of the estimate; reward, ends and infos are made of the truth.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lpv_track_env import kernels as k
+from lpv_track_env.conditions import layout
+from lpv_track_env.conditions.sensors import (
+    DRAWS,
+    PERIOD_DRAW,
+    begin_estimate,
+    draw_conditions,
+    estimate,
+    offset_of,
+    read_sensors,
+    receive_satellites,
+)
+from lpv_track_env.conditions.vehicle import blow, command_age, move, send, serve, stop_acceleration
+from lpv_track_env.episodes import begin
+from lpv_track_env.estimation import filter as filtering
+from trajectories.compilation import compiled, compiled_in_place, compiled_internal
+from trajectories.projection import SEARCH_WINDOW
+
+Array = NDArray[Any]
+
+
+@compiled_in_place
+def take_command(m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array) -> int:
+    """Begin a control period: send its command, if it can be; the bits of what was clipped."""
+    p, queue = constants, m[layout.TAIL : layout.ways_start(spec)]
+    filter_memory = m[layout.filter_start(spec) :]
+    now = memory[k.STEPS] * p[k.PERIOD]
+    bits = 0
+    if m[layout.FREE_AT] > now + layout.INSTANT:
+        # The controller is still busy with an earlier command: it misses its turn.
+        m[layout.MISSES] += 1.0
+        m[layout.MISSED_IN_A_ROW] += 1.0
+    else:
+        # Rates are limited over the time since the last command.
+        periods = 1.0 + m[layout.MISSED_IN_A_ROW]
+        a, delta, bits = k.actuate(
+            a, delta, m[layout.COMMAND_A], m[layout.COMMAND_DELTA], p[k.MAX_STEERING],
+            periods * p[k.STEERING_STEP], p[k.LOWEST_ACCELERATION], p[k.HIGHEST_ACCELERATION],
+            periods * p[k.ACCELERATION_STEP],
+        )  # fmt: skip
+        m[layout.MISSED_IN_A_ROW] = 0.0
+        send(m, queue, now, a, delta, offset_of(filter_memory, spec))
+    m[layout.LATENCY] = m[layout.OCCUPIED] = -1.0
+    blind = (
+        spec[layout.ESTIMATOR] == layout.EKF
+        and filter_memory[filtering.FIX_AGE] > spec[layout.MAX_FIX_AGE]
+    )
+    stale = command_age(m, queue, now) > spec[layout.MAX_COMMAND_AGE] + layout.INSTANT
+    m[layout.STOPPING] = 0.0
+    if blind or stale:
+        m[layout.STOPPING] = 1.0
+        # The drive goes on from where it is when commands count again: within the jerk limit.
+        m[layout.COMMAND_A] = m[layout.SERVO_A]
+    return bits
+
+
+@compiled_in_place
+def end_period(
+    m: Array, memory: Array, vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, bits: int,
+    spec: Array, constants: Array, table: Array, observation: Array, key: Any, episode: Any,
+    work: Array,
+) -> int:  # fmt: skip
+    """End a control period with a new state: errors, end, reward, sensors, estimate."""
+    p, filtered = constants, layout.filter_start(spec)
+    ways, filter_memory = m[layout.ways_start(spec) : filtered], m[filtered:]
+    end = k.finish(
+        memory, p, table, observation, vx, vy, psi, r, x, y, m[layout.SERVO_A],
+        m[layout.SERVO_DELTA], bits,
+    )  # fmt: skip
+    if end == k.NON_FINITE:
+        # What was seen last stays: there is no state that sensors could read.
+        return end
+    now = memory[k.STEPS] * p[k.PERIOD]
+    draw = PERIOD_DRAW + DRAWS * int(memory[k.STEPS])
+    read_sensors(m, memory, key, episode, draw, p[k.PERIOD])
+    receive_satellites(m, ways, memory, now, key, episode, draw, spec)
+    estimate(m, ways, filter_memory, memory, now, spec, work)
+    see(m, p, table, observation, vx * p[k.PERIOD])
+    return end
+
+
+@compiled_in_place
+def drive_under_conditions(
+    m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array, table: Array,
+    observation: Array, key: Any, episode: Any, work: Array,
+) -> int:  # fmt: skip
+    """One control period of an episode under conditions, in place; the code of its end."""
+    bits = take_command(m, memory, a, delta, spec, constants)
+    period = constants[k.PERIOD]
+    blow(m, key, episode, PERIOD_DRAW + DRAWS * (int(memory[k.STEPS]) + 1), period)
+    queue = m[layout.TAIL : layout.ways_start(spec)]
+    vx, vy, psi, r, x, y = move(m, queue, memory, constants, memory[k.STEPS] * period)
+    return end_period(
+        m, memory, vx, vy, psi, r, x, y, bits, spec, constants, table, observation, key, episode,
+        work,
+    )  # fmt: skip
+
+
+@compiled_internal
+def see(m: Array, constants: Array, table: Array, observation: Array, ahead: Any) -> None:
+    """Find the estimate on the path and make the observation of it."""
+    # A fix may move the estimate by more than the vehicle drives in a period.
+    window = min(max(SEARCH_WINDOW, 1.5 * abs(ahead)), constants[k.LENGTH])
+    k.look(m[layout.ESTIMATE : layout.TAIL], constants, table, observation, ahead, window)
+
+
+@compiled
+def begin_under_conditions(
+    m: Array, memory: Array, spec: Array, constants: Array, table: Array, observation: Array,
+    draws: Array, given: Array,
+) -> None:  # fmt: skip
+    """Begin an episode under conditions: draw them and the start, `given` as `episodes.begin`.
+
+    `draws` holds key and number of the episode, (2,) uint64.
+    """
+    key, episode = draws[0], draws[1]
+    begin(memory, constants, table, observation, key, episode, given)
+    for j in range(m.shape[0]):
+        m[j] = 0.0
+    draw_conditions(m, spec, key, episode)
+    for j in range(7):
+        m[layout.PLANT + j] = constants[j]
+    m[layout.PLANT] *= m[layout.MASS_FACTOR]
+    m[layout.PLANT + 1] *= m[layout.INERTIA_FACTOR]
+    m[layout.PLANT + 4] *= m[layout.FRONT_STIFFNESS_FACTOR]
+    m[layout.PLANT + 5] *= m[layout.REAR_STIFFNESS_FACTOR]
+    m[layout.PLANT + 6] *= m[layout.ROLLING_FACTOR]
+    m[layout.LATENCY] = m[layout.OCCUPIED] = -1.0
+    m[layout.SERVO_A], m[layout.SERVO_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]
+    m[layout.COMMAND_A], m[layout.COMMAND_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]
+    m[layout.TAIL] = 0.0
+    m[layout.TAIL + 1], m[layout.TAIL + 2] = memory[k.ACCELERATION], memory[k.STEERING]
+    m[layout.QUEUED] = 1.0
+    begin_estimate(m, m[layout.filter_start(spec) :], memory, key, episode, PERIOD_DRAW, spec)
+    e = m[layout.ESTIMATE : layout.TAIL]
+    e[k.ACCELERATION], e[k.STEERING] = memory[k.ACCELERATION], memory[k.STEERING]
+    if spec[layout.ESTIMATOR] == layout.TRUTH:
+        e[k.STEERING] += m[layout.STEERING_OFFSET]
+    e[k.ARC_LENGTH] = memory[k.ARC_LENGTH]
+    see(m, constants, table, observation, 0.0)
+
+
+@compiled
+def advance_under_conditions(
+    data: Array, table: Array, m: Array, spec: Array, work: Array, draws: Array
+) -> tuple[int, Any, Any, Any, Any, int, Any, Any, Any, Any, Any, Any, Any]:
+    """`kernels.advance` under conditions: one period of a single environment, in place.
+
+    `draws` holds key and number of the episode, (2,) uint64.
+    """
+    a, delta = data[0], data[1]
+    c = data[k.MEMORY : k.CONSTANTS]
+    if math.isfinite(a) and math.isfinite(delta):
+        end = drive_under_conditions(
+            m, c, a, delta, spec, data[k.CONSTANTS : k.OBSERVATION], table,
+            data[k.OBSERVATION :].view(np.float32), draws[0], draws[1], work,
+        )  # fmt: skip
+    else:
+        end = k.NOT_FINITE
+    j = k.TERMS
+    return (
+        end, c[k.ARC_LENGTH], c[k.LATERAL_ERROR], c[k.HEADING_ERROR], c[k.SPEED_ERROR],
+        int(c[k.CLIPPED]), c[k.REWARD], c[j], c[j + 1], c[j + 2], c[j + 3], c[j + 4], c[j + 5],
+    )  # fmt: skip
+
+
+@compiled
+def command_under_conditions(data: Array, m: Array, spec: Array) -> tuple[Any, Any, int]:
+    """Begin a control period of a plant that is not the kernels' bicycle.
+
+    Returns the mean acceleration that the drive gives over it (m/s^2), the angle at which the
+    wheels stand at its end (rad), and the bits of what was clipped.
+    """
+    memory, constants = data[k.MEMORY : k.CONSTANTS], data[k.CONSTANTS : k.OBSERVATION]
+    bits = take_command(m, memory, data[0], data[1], spec, constants)
+    queue = m[layout.TAIL : layout.ways_start(spec)]
+    substeps, now = int(constants[k.SUBSTEPS]), memory[k.STEPS] * constants[k.PERIOD]
+    h = constants[k.PERIOD] / substeps
+    braking = stop_acceleration(m, constants)
+    m[layout.MEAN_A] = m[layout.MEAN_DELTA] = 0.0
+    for i in range(substeps):
+        a, delta = serve(m, queue, braking, now + i * h, h)
+        m[layout.MEAN_A] += a / substeps
+        m[layout.MEAN_DELTA] += delta / substeps
+    return m[layout.MEAN_A], m[layout.SERVO_DELTA] + m[layout.STEERING_OFFSET], bits
+
+
+@compiled
+def conclude_under_conditions(
+    data: Array, table: Array, m: Array, spec: Array, work: Array, draws: Array, state: Array,
+    bits: int,
+) -> int:  # fmt: skip
+    """End a control period that another plant has driven to a `state` (6,)."""
+    return end_period(
+        m, data[k.MEMORY : k.CONSTANTS], state[0], state[1], state[2], state[3], state[4],
+        state[5], bits, spec, data[k.CONSTANTS : k.OBSERVATION], table,
+        data[k.OBSERVATION :].view(np.float32), draws[0], draws[1], work,
+    )  # fmt: skip

@@ -1,0 +1,199 @@
+"""Compiled kernels of a real vehicle: late commands, lagging actuators, other tyres, wind."""
+
+import math
+from typing import Any
+
+from numpy.typing import NDArray
+
+from lpv_track_env import kernels as k
+from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, compiled_inverse_speed
+from lpv_track_env.conditions import WIND_LEVER, layout
+from lpv_track_env.draws import gaussian
+from lpv_track_env.integration import integrate
+from lpv_track_env.vehicle import GRAVITY
+from trajectories.compilation import compiled_in_place, compiled_internal
+
+Array = NDArray[Any]
+
+AIR_DENSITY = 1.225
+"""kg/m^3, standard atmosphere at sea level."""
+GUST_DRAW = 32
+"""Place of the gust's draw among those of a control period, see `conditions_sensors`."""
+STOP_DECELERATION = 2.0
+"""m/s^2 of a controlled stop."""
+
+
+def controlled_stop(rolling_deceleration: Any, max_jerk: Any, speed: Any) -> Any:
+    """Acceleration command (m/s^2) that brakes from a speed >= 0 (m/s) down to standstill.
+
+    Half the jerk limit (m/s^3) brings deceleration and speed to zero together.
+    """
+    return rolling_deceleration - min(STOP_DECELERATION, math.sqrt(max_jerk * speed))
+
+
+compiled_controlled_stop = compiled_internal(controlled_stop)
+
+
+@compiled_internal
+def send(m: Array, queue: Array, now: Any, a: Any, delta: Any, offset: Any) -> None:
+    """Send a command made from readings at `now`, its steering less an offset: it lands later."""
+    latency, occupied = m[layout.LATENCY], m[layout.OCCUPIED]
+    if latency < 0.0:
+        latency = m[layout.COMPUTING_DELAY]
+    if occupied < 0.0:
+        occupied = latency
+    m[layout.FREE_AT] = now + occupied
+    m[layout.COMMAND_A], m[layout.COMMAND_DELTA] = a, delta
+    landing = now + latency
+    room = queue.shape[0] // layout.COMMAND
+    newest = int(m[layout.NEWEST])
+    # One that lands before those sent earlier takes their place.
+    while m[layout.QUEUED] > 1.0 and queue[newest * layout.COMMAND] >= landing:
+        newest = (newest - 1 + room) % room
+        m[layout.QUEUED] -= 1.0
+    newest = (newest + 1) % room
+    queue[newest * layout.COMMAND] = landing
+    queue[newest * layout.COMMAND + 1] = a
+    queue[newest * layout.COMMAND + 2] = delta - offset
+    m[layout.NEWEST] = newest
+    m[layout.QUEUED] = min(m[layout.QUEUED] + 1.0, float(room))
+
+
+@compiled_internal
+def held(m: Array, queue: Array, entry: int, begins: Any, ends: Any) -> Any:
+    """Mean of a command's entry (1: a, 2: delta) over a time, s, as it came in."""
+    room = queue.shape[0] // layout.COMMAND
+    at, left = int(m[layout.NEWEST]), int(m[layout.QUEUED])
+    total, end, value = 0.0, ends, 0.0
+    while left > 0 and end > begins:
+        value = queue[at * layout.COMMAND + entry]
+        landing = queue[at * layout.COMMAND]
+        if landing < end:
+            start = max(landing, begins)
+            total += (end - start) * value
+            end = start
+        at, left = (at - 1 + room) % room, left - 1
+    if end > begins:
+        total += (end - begins) * value
+    return total / (ends - begins)
+
+
+@compiled_internal
+def secant(stiffness: Any, slip: Any, limit: Any) -> Any:
+    """Lateral force per slip angle at a slip (rad), up to `limit` (N): the brush model's.
+
+    F = C a (1 - z + z^2/3) with z = C |a| / (3 limit) up to z = 1, where all slides. (Pacejka, Tire
+    and Vehicle Dynamics, section 3.2, parabolic pressure.)
+    """
+    if not math.isfinite(limit):
+        return stiffness
+    z = stiffness * abs(slip) / (3.0 * limit)
+    if z < 1.0:
+        return stiffness * (1.0 - z + z * z / 3.0)
+    return limit / abs(slip)
+
+
+@compiled_internal
+def blow(m: Array, key: Any, episode: Any, draw: int, period: Any) -> None:
+    """Let the wind's gust go on by a period: first order, of stationary deviation."""
+    kept = math.exp(-period / m[layout.GUST_TIME])
+    first, _ = gaussian(key, episode, draw + GUST_DRAW)
+    m[layout.GUST] = (
+        kept * m[layout.GUST] + m[layout.GUST_SPEED] * math.sqrt(1.0 - kept * kept) * first
+    )
+
+
+@compiled_internal
+def side_wind(m: Array, vx: Any, vy: Any, psi: Any) -> tuple[Any, Any]:
+    """Lateral (m/s^2) and yaw acceleration (rad/s^2) by the wind.
+
+    F = rho/2 A |v| v_y with the air's velocity v in the body's frame: the side force coefficient
+    goes with the sine of the flow's angle.
+    """
+    c, s = math.cos(psi), math.sin(psi)
+    wind = m[layout.WIND_SPEED] + m[layout.GUST]
+    wx, wy = wind * m[layout.WIND_X], wind * m[layout.WIND_Y]
+    ahead, aside = c * wx + s * wy - vx, c * wy - s * wx - vy
+    flow = math.sqrt(ahead * ahead + aside * aside)
+    force = 0.5 * AIR_DENSITY * m[layout.SIDE_AREA] * flow * aside
+    return force / m[layout.PLANT], force * WIND_LEVER / m[layout.PLANT + 1]
+
+
+@compiled_internal
+def command_age(m: Array, queue: Array, now: Any) -> Any:
+    """Time since the command in force came in, s."""
+    room = queue.shape[0] // layout.COMMAND
+    at, left = int(m[layout.NEWEST]), int(m[layout.QUEUED])
+    while left > 1 and queue[at * layout.COMMAND] > now:
+        at, left = (at - 1 + room) % room, left - 1
+    return now - queue[at * layout.COMMAND]
+
+
+@compiled_internal
+def stop_acceleration(m: Array, constants: Array) -> Any:
+    """Acceleration that brakes to a stop by the estimated speed, within the jerk limit, m/s^2."""
+    speed = max(m[layout.ESTIMATE + VX], 0.0)
+    jerk = constants[k.ACCELERATION_STEP] / constants[k.PERIOD]
+    wanted = compiled_controlled_stop(constants[6], jerk, speed)
+    return max(wanted, m[layout.SERVO_A] - constants[k.ACCELERATION_STEP])
+
+
+@compiled_internal
+def serve(m: Array, queue: Array, braking: Any, begins: Any, h: Any) -> tuple[Any, Any]:
+    """Let the servos work for h seconds; means of what they report over them, a and delta.
+
+    First order, exactly; the means are what an integrator that holds its inputs wants. `braking` is
+    the acceleration of a vehicle that stops by itself.
+    """
+    lag, ends, dead = m[layout.DRIVE_LAG], begins + h, m[layout.DRIVE_DEAD_TIME]
+    kept = math.exp(-h / lag) if lag > 0.0 else 0.0
+    wanted = braking if m[layout.STOPPING] > 0.5 else held(m, queue, 1, begins - dead, ends - dead)
+    behind = m[layout.SERVO_A] - wanted
+    a = wanted + behind * ((1.0 - kept) * lag / h)
+    m[layout.SERVO_A] = wanted + behind * kept
+    lag, dead = m[layout.STEERING_LAG], m[layout.STEERING_DEAD_TIME]
+    kept = math.exp(-h / lag) if lag > 0.0 else 0.0
+    wanted = held(m, queue, 2, begins - dead, ends - dead)
+    behind = m[layout.SERVO_DELTA] - wanted
+    delta = wanted + behind * ((1.0 - kept) * lag / h)
+    m[layout.SERVO_DELTA] = wanted + behind * kept
+    return a, delta
+
+
+@compiled_in_place
+def move(
+    m: Array, queue: Array, memory: Array, constants: Array, now: Any
+) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """State after a control period of the real vehicle; notes servos and mean inputs in `m`."""
+    p, q = constants, layout.PLANT
+    substeps = int(p[k.SUBSTEPS])
+    h = p[k.PERIOD] / substeps
+    vx, vy, psi, r = memory[VX], memory[VY], memory[PSI], memory[YAW_RATE]
+    x, y = memory[X], memory[Y]
+    load = m[q] * GRAVITY / (m[q + 2] + m[q + 3]) * m[layout.FRICTION]
+    total_a = total_delta = 0.0
+    windy = m[layout.WIND_SPEED] > 0.0 or m[layout.GUST_SPEED] > 0.0
+    braking = stop_acceleration(m, p)
+    for i in range(substeps):
+        a, delta = serve(m, queue, braking, now + i * h, h)
+        total_a += a
+        total_delta += delta
+        wheels = delta + m[layout.STEERING_OFFSET]
+        inverse = compiled_inverse_speed(vx)
+        front = wheels * (vx * inverse) - (vy + m[q + 2] * r) * inverse
+        rear = (m[q + 3] * r - vy) * inverse
+        push = spin = 0.0
+        if windy:
+            push, spin = side_wind(m, vx, vy, psi)
+        # Half the wind's push before and half after the step (Strang): second order.
+        vx, vy, psi, r, x, y = integrate(
+            vx, vy + 0.5 * h * push, psi, r + 0.5 * h * spin, x, y,
+            a / m[layout.MASS_FACTOR], wheels,
+            m[q], m[q + 1], m[q + 2], m[q + 3],
+            secant(m[q + 4], front, load * m[q + 3]), secant(m[q + 5], rear, load * m[q + 2]),
+            m[q + 6], h, 1,
+        )  # fmt: skip
+        vy += 0.5 * h * push
+        r += 0.5 * h * spin
+    m[layout.MEAN_A], m[layout.MEAN_DELTA] = total_a / substeps, total_delta / substeps
+    return vx, vy, psi, r, x, y

@@ -1,0 +1,291 @@
+"""The real-time NMPC as an agent of batches: memories, weights, and observations of every kind."""
+
+import subprocess
+import sys
+
+import numba
+import numpy as np
+import pytest
+
+from agents.nmpc import rti
+from agents.weights import TrackingWeights, WeightSchedule
+from lpv_track_env.observation import SCALARS
+from tests.helpers.driven_vehicles import drives, environment, made
+from trajectories import CurvatureBands
+
+BEGIN = np.array([True])
+
+
+def most_threads() -> int:
+    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+
+
+# Batches and memories ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [1, 3, 17])
+@pytest.mark.parametrize("threads", [1, min(2, most_threads())])
+def test_batch_is_single_vehicles_bit_for_bit(n: int, threads: int) -> None:
+    rows, together = drives(n, 8), made(threads=threads)
+    batches = [together.predict(row)[0] for row in rows]
+    alone = made()
+    for k in range(n):
+        alone.reset()
+        for step, row in enumerate(rows):
+            action, _ = alone.predict(row[k])
+            assert action.shape == (2,)
+            assert action.dtype == np.float32
+            np.testing.assert_array_equal(batches[step][k], action)
+
+
+@pytest.mark.parametrize("n", [1, 3, 17])
+def test_episode_start_clears_the_marked_rows_alone(n: int) -> None:
+    # From the time on at which the steering no longer runs along its limits.
+    rows, agent, untouched, fresh = drives(n, 38)[30:], made(), made(), made()
+    marked = np.arange(n) % 3 == 0
+    for row in rows[:5]:
+        agent.predict(row, None, np.zeros(n, dtype=bool))
+        untouched.predict(row)
+    for k, row in enumerate(rows[5:]):
+        actions, _ = agent.predict(row, None, marked if k == 0 else np.zeros(n, dtype=bool))
+        going_on, beginning = untouched.predict(row)[0], fresh.predict(row)[0]
+        np.testing.assert_array_equal(actions[~marked], going_on[~marked])
+        np.testing.assert_array_equal(actions[marked], beginning[marked])
+        # In the row that begins its warm start is gone, so the actions do differ.
+        if k == 0:
+            assert (going_on[marked] != beginning[marked]).any()
+
+
+def test_failures_of_one_row_are_not_anothers() -> None:
+    rows, agent, healthy = drives(3, 8), made(max_failures=2), made(max_failures=2)
+    told = []
+    for k, row in enumerate(rows):
+        lost = row.copy()
+        if k >= 2:
+            lost[1, 5] = np.nan
+        if k >= 4:
+            lost[2, 0] = np.inf
+        actions, memory = agent.predict(lost, None, np.array([False, False, k == 7]))
+        np.testing.assert_array_equal(actions[0], healthy.predict(row)[0][0])
+        told.append([agent.diagnostics(memory[i])["fallback"] for i in range(3)])
+    # Row 2 begins anew in the last step: no plan any more, one failure.
+    assert [row[1] for row in told] == ["", "", "plan", "plan", "stop", "stop", "stop", "stop"]
+    assert [row[2] for row in told] == ["", "", "", "", "plan", "plan", "stop", "stanley"]
+    assert not any(row[0] for row in told)
+
+
+def test_failures_are_found_in_every_threads_share() -> None:
+    rows, alone, shared = drives(5, 4), made(), made(threads=min(2, most_threads()))
+    for row in rows:
+        lost = row.copy()
+        lost[[0, 4], 5] = np.nan
+        np.testing.assert_array_equal(alone.predict(lost)[0], shared.predict(lost)[0])
+    memory = shared.predict(lost)[1]
+    assert [shared.diagnostics(memory[k])["fallback"] for k in range(5)] == [
+        "stanley", "", "", "", "stanley"
+    ]  # fmt: skip
+
+
+def test_control_of_one_row_of_a_batch_is_predict_of_that_row() -> None:
+    sets = tuple(TrackingWeights(R=(0.01, scale)) for scale in (1.0, 3.0, 9.0, 27.0))
+    schedule = WeightSchedule(CurvatureBands(), sets)
+    rows, together, single = drives(3, 8), made(weights=schedule), made(weights=schedule)
+    unpack = together.task.layout.unpack
+    _, memory = single.predict(rows[0])
+    together.predict(rows[0])
+    for row in rows[1:]:
+        row[1, 5] = np.nan
+        wanted, reached = together.predict(row)
+        for k in range(3):
+            action = single.control(unpack(row[k]), memory[k])
+            np.testing.assert_array_equal(np.float32(action), wanted[k])
+            ours = single.diagnostics(memory[k])
+            assert ours["fallback"] == together.diagnostics(reached[k])["fallback"]
+        np.testing.assert_array_equal(memory.bands, reached.bands)
+        np.testing.assert_array_equal(memory.plans, reached.plans)
+        np.testing.assert_array_equal(memory.flags, reached.flags)
+    assert ours["status"] == "SUCCESS"
+    assert single.diagnostics(memory[1])["status"] == "NAN"
+
+
+@pytest.mark.parametrize("threads", [0, -1, 10_000])
+def test_impossible_threads_are_refused(threads: int) -> None:
+    with pytest.raises(ValueError, match=rf"threads must be from 1 to \d+ .*, not {threads}"):
+        made(threads=threads)
+
+
+def test_nothing_is_compiled_within_a_control_period() -> None:
+    """In a fresh process: making the agent compiles, or loads, all that its first call needs."""
+    code = (
+        "import gymnasium, lpv_track_env, agents\n"
+        "from agents.nmpc import rti\n"
+        "env = gymnasium.make('lpv_track_env/PathTracking-v0', trajectory='u-turn')\n"
+        "observation, _ = env.reset(seed=0)\n"
+        "agent = agents.make('lpv-nmpc', env)\n"
+        "made = len(rti.control.signatures)\n"
+        "agent.predict(observation)\n"
+        "print(made, len(rti.control.signatures))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1", "1"]
+
+
+def test_memories_are_handed_in_and_out() -> None:
+    rows, agent, other = drives(3, 6), made(), made()
+    # Two drives with one agent: what is handed in is written, its own memory is left alone.
+    _, mine = agent.predict(rows[0], None, BEGIN)
+    _, handed = other.predict(rows[1][::-1])
+    wanted, twin = [made(), made()], []
+    wanted[0].predict(rows[0])
+    wanted[1].predict(rows[1][::-1])
+    for row in rows[2:]:
+        first, back = agent.predict(row)
+        second, handed = agent.predict(row[::-1], handed)
+        assert back is mine
+        np.testing.assert_array_equal(first, wanted[0].predict(row)[0])
+        np.testing.assert_array_equal(second, wanted[1].predict(row[::-1])[0])
+        twin.append(handed)
+    assert all(memory is twin[0] for memory in twin)
+    assert len(handed) == 3
+    # Of another size: it begins anew, as every agent does.
+    actions, new = agent.predict(rows[3][:2], handed)
+    np.testing.assert_array_equal(actions, made().predict(rows[3][:2])[0])
+    assert len(new) == 2
+
+
+def test_actions_and_diagnostics_handed_out_are_copies() -> None:
+    rows, agent, untouched = drives(3, 5), made(), made()
+    for row in rows:
+        actions, memory = agent.predict(row)
+        np.testing.assert_array_equal(actions, untouched.predict(row)[0])
+        told = agent.diagnostics(memory[1])
+        for value in (actions, told["plan"], told["slack"], told["weights"]):
+            value[:] = 7.0
+
+
+def test_diagnostics_of_a_row() -> None:
+    rows, agent = drives(3, 2), made()
+    for row in rows:
+        _, memory = agent.predict(row)
+    single = made()
+    for k in range(3):
+        single.reset()
+        for row in rows:
+            _, alone = single.predict(row[k])
+        wanted, told = single.diagnostics(alone[0]), agent.diagnostics(memory[k])
+        assert told.keys() == wanted.keys()
+        assert told["status"] == "SUCCESS"
+        assert told["plan"].shape == (21, 2)
+        # The plan begins where the vehicle is, in the frame of the path's foot point.
+        np.testing.assert_allclose(told["plan"][0], [0.0, rows[-1][k][5]])
+        assert told["slack"].shape == (3,)
+        for name in ("status", "iterations", "cost", "fallback"):
+            assert told[name] == wanted[name]
+    np.testing.assert_array_equal(agent.diagnostics(memory[-1])["plan"], told["plan"])
+    with pytest.raises(IndexError, match="row 3 of 3"):
+        memory[3]
+
+
+@pytest.mark.parametrize("shape", [(47,), (49,), (3, 47), (0, 47), (2, 3, 48), (48, 1), ()])
+def test_observations_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    agent = made()
+    with pytest.raises(ValueError, match="this layout has 48 entries"):
+        agent.predict(np.zeros(shape, dtype=np.float32))
+
+
+def test_any_array_of_an_observation_does() -> None:
+    """Other memory layouts and types act alike, and none has the solver compiled for it anew."""
+    rows, agent = drives(3, 1)[0], made()
+    wanted = agent.predict(rows)[0]
+    known = len(rti.control.signatures)  # type: ignore[attr-defined]
+    doubles = rows.astype(np.float64)
+    fixed = doubles.copy()
+    fixed.flags.writeable = False
+    kinds = {
+        "strided": np.repeat(rows, 2, axis=0)[::2], "Fortran's order": np.asfortranarray(rows),
+        "double": doubles, "doubles, strided": np.repeat(doubles, 2, axis=1)[:, ::2],
+        "read-only doubles": fixed, "list": rows.tolist(),
+    }  # fmt: skip
+    for name, same in kinds.items():
+        actions, _ = agent.predict(same, None, np.ones(3, dtype=bool))
+        np.testing.assert_array_equal(actions, wanted, err_msg=name)
+        assert len(rti.control.signatures) == known, f"compiled anew for: {name}"  # type: ignore[attr-defined]
+
+
+# Settings ------------------------------------------------------------------------------------
+
+
+def test_new_weights_hold_from_the_next_step_and_keep_the_warm_start() -> None:
+    rows, agent, heavy = drives(3, 4), made(), TrackingWeights(Q=(1.0, 1.0, 100.0, 100.0))
+    born, old = made(weights=heavy), made()
+    _, memory = agent.predict(rows[0])
+    _, state = old.predict(rows[0])
+    assert agent.set_weights(heavy)
+    assert not np.array_equal(agent.predict(rows[1])[0], old.predict(rows[1])[0])
+    # An agent made with these weights that goes on from the same memory does the same.
+    _, state = old.predict(rows[0], None, BEGIN)
+    actions, _ = agent.predict(rows[1], agent.predict(rows[0], None, BEGIN)[1])
+    assert len(state) == len(memory) == 3
+    old.set_weights(heavy)
+    _, state = old.predict(rows[0], None, BEGIN)
+    np.testing.assert_array_equal(born.predict(rows[1], state)[0], actions)
+
+
+def test_schedule_by_band_chooses_for_every_row() -> None:
+    """Each row is what an agent with that band's weights does."""
+    sets = tuple(TrackingWeights(R=(0.01, scale)) for scale in (1.0, 3.0, 9.0, 27.0))
+    schedule = WeightSchedule(CurvatureBands(), sets)
+    rows, agent = drives(17, 1)[0], made(weights=schedule)
+    actions, memory = agent.predict(rows)
+    assert len(set(memory.bands)) > 1
+    for k, (row, action, band) in enumerate(zip(rows, actions, memory.bands, strict=True)):
+        fixed = made(weights=sets[band])
+        wanted, alone = fixed.predict(row)
+        np.testing.assert_array_equal(wanted, action)
+        for told in (agent.diagnostics(memory[k]), fixed.diagnostics(alone[0])):
+            np.testing.assert_array_equal(told["weights"], sets[band].as_array())
+    broken = rows.copy()
+    broken[0, len(SCALARS)] = np.nan
+    assert np.isfinite(agent.predict(broken)[0]).all()
+
+
+def test_control_period_shorter_than_the_previews() -> None:
+    """It plans on periods of 0.1 s, acts every 0.05 s, and moves its plan on by halves."""
+    env = environment(control_period=0.05, preview_period=0.1, preview_steps=15)
+    agent = made(env)
+    assert agent.problem.period == 0.1
+    np.testing.assert_allclose(
+        agent.problem.input_steps[:2, 0], agent.problem.vehicle.max_jerk * np.array([0.05, 0.1])
+    )
+    observation, info = env.reset(seed=0)
+    lateral, clipped, done = [], 0, False
+    while not done:
+        action, memory = agent.predict(observation)
+        assert agent.diagnostics(memory[0])["status"] == "SUCCESS"
+        observation, _, terminated, truncated, info = env.step(action)
+        lateral.append(abs(info["lateral_error"]))
+        clipped += bool(info["clipped"])
+        done = terminated or truncated
+    assert info["end"] == "finished"
+    assert max(lateral) < 0.05
+    assert clipped == 0
+    # Blind, it follows its last plan: each of its periods lasts two steps.
+    env.reset(options={"arc_length": 40.0})
+    observation, _ = env.reset(options={"arc_length": 40.0, "lateral_error": 0.3})
+    _, memory = agent.predict(observation, None, BEGIN)
+    plan, lost = memory.plans[0].copy(), observation.copy()
+    lost[5] = np.nan
+    followed = [agent.predict(lost)[0] for _ in range(4)]
+    np.testing.assert_allclose(followed, plan[[0, 1, 1, 2]], rtol=1e-6)
+
+
+def test_horizon_shorter_than_the_preview() -> None:
+    rows, agent = drives(3, 1)[0], made(horizon=7)
+    _, memory = agent.predict(rows)
+    assert agent.diagnostics(memory[0])["plan"].shape == (8, 2)
+    # What lies beyond the horizon is not looked at.
+    changed = rows.copy()
+    changed[:, len(SCALARS) + 7 : len(SCALARS) + 20] = 0.1
+    np.testing.assert_array_equal(
+        made(horizon=7).predict(changed)[0], made(horizon=7).predict(rows)[0]
+    )

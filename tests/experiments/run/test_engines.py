@@ -1,0 +1,150 @@
+"""Engines: what runs where, and that neither a dead worker nor a stop loses or leaves anything."""
+
+import multiprocessing
+import os
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from experiments.run.case import Case
+from experiments.run.engines import in_process, local_pool
+
+Spec = Mapping[str, Any]
+
+
+def specs(count: int, **notes: Any) -> list[dict[str, Any]]:
+    """Cases told apart by their seed; `notes` reach the run functions below."""
+    return [
+        {"agent": "nobody", "trajectory": "nowhere", "seed": seed, "env_settings": notes}
+        for seed in range(count)
+    ]
+
+
+def note(spec: Spec) -> dict[str, Any]:
+    return {"id": Case(**spec).id, "seed": spec["seed"], "status": "ok", "pid": os.getpid()}
+
+
+def kill_some(spec: Spec) -> dict[str, Any]:
+    if spec["seed"] in spec["env_settings"]["killers"]:
+        os._exit(9)
+    time.sleep(0.02)
+    return note(spec)
+
+
+def kill_once(spec: Spec) -> dict[str, Any]:
+    """Seed 1 kills its worker the first time only."""
+    mark = Path(spec["env_settings"]["mark"])
+    if spec["seed"] == 1 and not mark.exists():
+        mark.touch()
+        os._exit(9)
+    return note(spec)
+
+
+def raise_one(spec: Spec) -> dict[str, Any]:
+    if spec["seed"] == 0:
+        raise ArithmeticError("no such luck")
+    time.sleep(120)
+    return note(spec)
+
+
+def linger(spec: Spec) -> dict[str, Any]:
+    time.sleep(0 if spec["seed"] == 0 else 120)
+    return note(spec)
+
+
+def workers_left(patience: float = 5.0) -> list[str]:
+    """Command lines of this process's spawned workers, once they had time to end."""
+    until = time.monotonic() + patience
+    while True:
+        found = [str(child) for child in multiprocessing.active_children()]
+        for entry in Path("/proc").glob("[0-9]*"):  # nothing where there is no /proc
+            try:
+                parent = entry.joinpath("stat").read_text().rpartition(")")[2].split()[1]
+                command = entry.joinpath("cmdline").read_bytes().replace(b"\0", b" ").decode()
+            except OSError:
+                continue
+            if int(parent) == os.getpid() and "spawn_main" in command:
+                found.append(command)
+        if not found or time.monotonic() > until:
+            return found
+        time.sleep(0.05)
+
+
+def seeds(results: Sequence[Mapping[str, Any]]) -> list[int]:
+    return sorted(result["seed"] for result in results)
+
+
+def test_both_engines_give_the_same_results() -> None:
+    cases, begun = specs(6), []
+    here = list(in_process(cases, run=note))
+    pooled = list(local_pool(cases, 2, run=note, started=begun.append))
+    assert [result["seed"] for result in here] == list(range(6))
+    assert {result["pid"] for result in here} == {os.getpid()}
+    assert os.getpid() not in {result["pid"] for result in pooled}
+    assert Counter(result["id"] for result in pooled) == Counter(result["id"] for result in here)
+    assert begun == cases
+    assert workers_left() == []
+
+
+@pytest.mark.parametrize(("workers", "killers"), [(1, [0]), (2, [0, 4])])
+def test_a_case_that_kills_its_worker_is_reported_and_no_other_suffers(
+    workers: int, killers: list[int]
+) -> None:
+    cases = specs(3 * workers, killers=killers)
+    results = list(local_pool(cases, workers, run=kill_some))
+    assert seeds(results) == list(range(3 * workers))
+    failed = [result for result in results if result["status"] != "ok"]
+    assert seeds(failed) == killers
+    for result in failed:
+        assert result["status"] == "failed"
+        assert "worker process died, twice" in result["error"]
+        assert result["id"] == Case(**cases[result["seed"]]).id
+        assert result["trajectory"] == "nowhere"
+        assert result["metrics"] == {}
+    assert workers_left() == []
+
+
+def test_a_worker_that_dies_once_costs_nothing(tmp_path: Path) -> None:
+    cases = specs(3, mark=str(tmp_path / "died"))
+    results = list(local_pool(cases, 1, run=kill_once))
+    assert seeds(results) == [0, 1, 2]
+    assert {result["status"] for result in results} == {"ok"}
+    assert (tmp_path / "died").exists()
+
+
+def test_what_a_run_raises_comes_through_and_ends_the_pool() -> None:
+    began = time.monotonic()
+    with pytest.raises(ArithmeticError, match="no such luck"):
+        list(local_pool(specs(6), 2, run=raise_one))
+    assert workers_left() == []
+    assert time.monotonic() - began < 60
+
+
+def test_in_process_passes_on_what_a_run_raises() -> None:
+    with pytest.raises(ArithmeticError, match="no such luck"):
+        list(in_process(specs(1), run=raise_one))
+
+
+def test_stopping_early_ends_the_workers() -> None:
+    began = time.monotonic()
+    run = local_pool(specs(6), 2, run=linger)
+    assert next(run)["seed"] == 0
+    run.close()  # type: ignore[attr-defined]
+    assert workers_left() == []
+    assert time.monotonic() - began < 60
+
+
+def test_more_workers_than_cases() -> None:
+    assert seeds(list(local_pool(specs(2), 5, run=note))) == [0, 1]
+    assert list(local_pool([], 5, run=note)) == []
+    assert workers_left() == []
+
+
+@pytest.mark.parametrize("workers", [0, -1])
+def test_no_workers_are_refused(workers: int) -> None:
+    with pytest.raises(ValueError, match=f"workers must be at least 1, not {workers}"):
+        next(local_pool(specs(1), workers, run=note))

@@ -1,0 +1,104 @@
+"""Suites: what they drive, and that all of it can be driven."""
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+import agents
+from experiments.run.case import Case
+from experiments.run.suites import (
+    BESIDE,
+    DEMONSTRATION,
+    HELD_OUT,
+    LEAST_SEEDS,
+    RAW,
+    SIX,
+    SUITES,
+    default_agents,
+)
+from experiments.training.seeds import TRAINING_PATHS, VALIDATION_PATHS
+from lpv_track_env.observation import ObservationLayout
+from tests.helpers.learned_policies import random_policy, written
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_cases_of_a_suite_are_valid_and_distinct(suite: str) -> None:
+    specs = SUITES[suite](default_agents(), [0, 1])
+    cases = [Case(**spec) for spec in specs]
+    assert len({case.id for case in cases}) == len(cases) > 0
+    ideal = [
+        case for case in cases if case.conditions == "simulation" and case.env_settings != BESIDE
+    ]
+    assert {case.seed for case in ideal} in (set(), {0, 1})
+    # Where chance has a say, intervals must mean something.
+    other = [case for case in cases if case not in ideal]
+    assert {case.seed for case in other} in (set(), set(range(LEAST_SEEDS)))
+    assert len(ideal) + len(other) == len(cases)
+
+
+def test_default_agents_are_those_to_drive_with() -> None:
+    assert set(agents.names()) - set(default_agents()) == {DEMONSTRATION}
+    drive = [Case(**spec) for suite in ("paper", "quick") for spec in
+             SUITES[suite](default_agents(), [0])]  # fmt: skip
+    assert {case.agent for case in drive} == set(default_agents())
+
+
+def test_what_ipopt_does_not_drive_in_one_suite_it_drives_in_another() -> None:
+    names, solved = default_agents(), "lpv-nmpc-ipopt"
+    counts = {
+        suite: Counter(
+            (spec["agent"], spec["trajectory"], spec["vehicle"], spec["speed_mode"])
+            for spec in SUITES[suite](names, [0])
+            if spec.get("conditions") is None
+        )
+        for suite in ("paper", "converged")
+    }
+    both = counts["paper"] + counts["converged"]
+    fast = {key[1:] for key in counts["paper"] if key[0] == "lpv-nmpc"}
+    assert {key[1:] for key in both if key[0] == solved} == fast
+    assert {key[1] for key in counts["paper"] if key[0] == solved} == set(SIX)
+    assert {key[1] for key in both} == {*SIX, *RAW}
+
+
+def test_realtime_drives_the_six_with_as_many_seeds_as_are_asked_for() -> None:
+    specs = SUITES["realtime"](["lpv-nmpc", "stanley"], range(20))
+    assert len(specs) == 2 * 6 * 20
+    assert {spec["conditions"] for spec in specs} == {"realtime"}
+    driven = Counter(spec["trajectory"] for spec in SUITES["paper"](["lpv-nmpc"], [0])
+                     if spec.get("conditions") == "realtime")  # fmt: skip
+    assert driven == dict.fromkeys(SIX, LEAST_SEEDS)
+
+
+def test_frozen_compares_both_forms_with_the_nmpc() -> None:
+    specs = SUITES["frozen"](["stanley"], [0])
+    forms = Counter((spec["agent"], str(spec.get("agent_settings", {}))) for spec in specs)
+    assert forms == {
+        ("lpv-nmpc", "{}"): 6,
+        (DEMONSTRATION, "{'form': 'literal'}"): 6,
+        (DEMONSTRATION, "{'form': 'sinc'}"): 6,
+    }
+
+
+def test_learned_policies_are_compared_on_paths_that_nobody_trained_on() -> None:
+    specs = SUITES["learned"](default_agents(), [0])
+    fast = set(default_agents()) - {"lpv-nmpc-ipopt"}
+    drives = Counter((spec["agent"], str(spec.get("conditions"))) for spec in specs)
+    alone = 6 + 6 * LEAST_SEEDS + len(HELD_OUT)
+    assert drives == {
+        **{(name, "None"): alone for name in fast},
+        **{(name, "realtime"): (6 + len(HELD_OUT)) * LEAST_SEEDS for name in fast},
+    }
+    numbers = [int(name.rpartition("-")[2]) for name in HELD_OUT]
+    assert len(numbers) == 20
+    assert max(numbers) < TRAINING_PATHS < VALIDATION_PATHS
+
+
+@pytest.mark.parametrize(("steps", "period", "raw"), [(20, 0.05, 0), (30, 0.05, 0), (30, 0.1, 6)])
+def test_a_policy_file_drives_raw_waypoints_if_it_was_made_for_their_preview(
+    steps: int, period: float, raw: int, tmp_path: Path
+) -> None:
+    file = written(tmp_path, random_policy(layout=ObservationLayout(steps, period)))
+    specs = SUITES["paper"]([str(file), "stanley"], [0])
+    drives = Counter(spec["agent"] for spec in specs if spec["trajectory"] in RAW)
+    assert drives == Counter({str(file): raw, "stanley": 6})

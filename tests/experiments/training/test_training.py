@@ -1,0 +1,416 @@
+"""Training: exact, resumable, honest about what it trains on, and it learns."""
+
+import importlib.util
+import io
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+import torch
+from stable_baselines3.common.logger import Logger
+
+from agents.learned.files import read as read_policy
+from experiments import cli
+from experiments.run.case import run_case
+from experiments.run.suites import HELD_OUT, SIX
+from experiments.training import checkpoint, options
+from experiments.training.environments import load_paths
+from experiments.training.hyperparameters import HYPERPARAMETERS
+from experiments.training.lock import alone_in
+from experiments.training.loop import Listener, make_trainer, train
+from experiments.training.seeds import (
+    TRAINING_EPISODES,
+    TRAINING_PATHS,
+    VALIDATION_EPISODES,
+    VALIDATION_PATHS,
+    episode_seed,
+    path_names,
+)
+from experiments.training.settings import (
+    ALGORITHMS,
+    REWARD,
+    TrainingSettings,
+    difference,
+    usual,
+)
+from experiments.training.validation import cases, validate
+from lpv_track_env.vehicle import VEHICLES
+
+TINY: dict[str, dict[str, Any]] = {
+    "ppo": {"steps": 768, "hyperparameters": {"rollout": 16, "batch": 64}},
+    "residual": {"steps": 768, "hyperparameters": {"rollout": 16, "batch": 64}},
+    "sac": {"steps": 384, "hyperparameters": {"learning_starts": 200, "gradient_steps": 2,
+                                              "batch": 32, "buffer": 256}},
+    "td3": {"steps": 384, "hyperparameters": {"learning_starts": 64, "gradient_steps": 3,
+                                              "batch": 32, "buffer": 256}},
+    "bc": {"steps": 768, "hyperparameters": {"round": 16, "updates": 20, "batch": 64}},
+}  # fmt: skip
+
+
+def tiny(algorithm: str, **changes: Any) -> TrainingSettings:
+    given = {
+        "envs": 16, "paths": 1, "validation": 1, "time_limit": 3.0, **TINY[algorithm], **changes,
+    }  # fmt: skip
+    return usual(algorithm, **{"segment": given["steps"] // 3, **given})
+
+
+def silent(*_: Any) -> None:
+    return
+
+
+SILENT = Listener(silent, silent, silent)
+
+
+def run(settings: TrainingSettings, folder: Path, listener: Listener = SILENT) -> dict[str, Any]:
+    """Train; the last checkpoint."""
+    train(settings, folder, listener, command="test")
+    kept = checkpoint.read(folder)
+    assert kept is not None
+    return kept
+
+
+def same_bits(one: Any, other: Any) -> bool:
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same_bits(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(same_bits, one, other))
+    if isinstance(one, torch.Tensor):
+        return one.dtype == other.dtype and one.numpy().tobytes() == other.numpy().tobytes()
+    return bool(one == other)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_same_seed_same_bits_also_when_interrupted(algorithm: str, tmp_path: Path) -> None:
+    settings = tiny(algorithm)
+    whole = run(settings, tmp_path / "whole")
+    assert settings.segments == len(whole["lines"]) == 3
+    assert whole["lines"][-1]["steps"] >= settings.steps
+
+    def interrupt(line: dict[str, Any]) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(settings, tmp_path / "parts", Listener(silent, silent, interrupt))
+    kept = checkpoint.read(tmp_path / "parts")
+    assert kept is not None
+    assert len(kept["lines"]) == 1
+    assert not same_bits(kept["trainer"], whole["trainer"])
+    parts = run(settings, tmp_path / "parts")
+    assert same_bits(parts["trainer"], whole["trainer"])
+    validations = [[line["validation"] for line in kept["lines"]] for kept in (whole, parts)]
+    assert validations[0] == validations[1]
+    weights = [tmp_path / name / "policy.safetensors" for name in ("whole", "parts")]
+    assert weights[0].read_bytes() == weights[1].read_bytes()
+
+
+def test_another_seed_gives_other_weights(tmp_path: Path) -> None:
+    one, other = (
+        run(tiny("bc", seed=seed), tmp_path / str(seed))["trainer"]["network"] for seed in (0, 1)
+    )
+    assert not same_bits(one, other)
+
+
+def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
+    seen: set[str] = set()
+    for seed in (0, 1, 999):
+        settings = tiny("ppo", seed=seed, paths=1000)
+        names = set(path_names(settings))
+        assert not names & seen
+        seen |= names
+        assert episode_seed(settings, 0) >= TRAINING_EPISODES
+        episodes = [episode_seed(settings, k) for k in range(3)]
+        assert np.diff(episodes).min() > settings.envs
+    numbers = [int(name.rpartition("-")[2]) for name in seen]
+    assert TRAINING_PATHS <= min(numbers) <= max(numbers) < VALIDATION_PATHS
+    validated = {case["trajectory"] for case in cases(tiny("ppo", validation=50), tmp_path)}
+    assert not validated & seen
+    assert min(int(name.rpartition("-")[2]) for name in validated) >= VALIDATION_PATHS
+    drawn = {case["seed"] for case in cases(tiny("ppo", validation=50), tmp_path)}
+    assert VALIDATION_EPISODES <= min(drawn) <= max(drawn) < TRAINING_EPISODES
+    for name in (*SIX, "T2-raw", *HELD_OUT):
+        with pytest.raises(ValueError, match="is for evaluation"):
+            tiny("ppo", trajectories=("circle", name))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"hyperparameters": {"learning_rat": 1.0}}, "learning_rate"),
+        ({"hyperparameters": {"learning_rate": "fast"}}, "must be like"),
+        ({"hyperparameters": {"batch": 0}}, "batch must be in"),
+        ({"hyperparameters": {"hidden": []}}, "must be like"),
+        ({"hyperparameters": {"discount": float("nan")}}, "must be like"),
+        ({"hyperparameters": {"activation": "selu"}}, "relu"),
+        ({"hyperparameters": {"origin": "actuator"}}, "actuators"),
+        ({"hyperparameters": {"origin": "lpv-nmpc"}}, "only residual"),
+        ({"reward": {"laterall": 1.0}}, "lateral"),
+        ({"reward": {"lateral": "high"}}, "must be a number"),
+        ({"conditions": ("realtme",)}, "realtime"),
+        ({"conditions": ()}, "at least one"),
+        ({"envs": 1}, "as many environments"),
+        ({"seed": 1000}, "seed"),
+        ({"vehicle": "m2"}, "m2-minibus"),
+        ({"segment": 0}, "segment"),
+        ({"segment": 255}, "at least 256 steps"),
+        ({"segment": 768, "start": "clone.json"}, "less than steps, 768"),
+        ({"hyperparameters": {"activation": "gelu"}}, "tanh"),
+        ({"hyperparameters": {"batch": 1}}, "batch must be in"),
+        ({"hyperparameters": {"discount": 1.5}}, "discount must be in"),
+        ({"hyperparameters": {"deviation": 0.0}}, "deviation must be in"),
+        ({"paths": 1001}, "at most 1000"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        tiny("ppo", **changes)
+    with pytest.raises(ValueError, match="ppo"):
+        usual("pppo")
+
+
+def test_settings_survive_json_and_tell_what_differs() -> None:
+    for algorithm in ALGORITHMS:
+        settings = usual(algorithm)
+        stored = json.loads(json.dumps(settings.as_dict()))
+        assert difference(settings, stored) is None
+        assert settings.hyperparameters == HYPERPARAMETERS[algorithm]
+        assert "seed is 3, there 0" in str(difference(usual(algorithm, seed=3), stored))
+
+
+def trained_clone(folder: Path, **changes: Any) -> Path:
+    settings = tiny("bc", steps=6000, segment=6000, envs=32, paths=2, time_limit=20.0, **changes)
+    train(settings, folder, SILENT, command="test")
+    return folder / "policy.json"
+
+
+def test_cloning_learns_to_drive(tmp_path: Path) -> None:
+    policy = trained_clone(tmp_path, hyperparameters={"round": 100, "updates": 300, "batch": 512})
+    for kind, limit in (("simulation", 0.1), ("realtime", 0.15)):
+        result = run_case({"agent": str(policy), "trajectory": "random-1", "conditions": kind})
+        assert result["end"] == "finished"
+        assert result["metrics"]["ale"] < limit
+    spent = read_policy(policy).training
+    assert spent["steps"] == spent["solves"] >= 6000
+    assert spent["seconds"] > 0.0
+    assert spent["settings"]["algorithm"] == "bc"
+
+
+def test_ppo_learns_to_drive_from_nothing(tmp_path: Path) -> None:
+    settings = usual(
+        "ppo", steps=1_000_000, segment=1_000_000, envs=256, paths=4, validation=1,
+        conditions=("simulation",), reward={**REWARD, "lateral_scale": 0.1},
+        hyperparameters={"batch": 2048, "last_learning_rate": 3e-4},
+    )  # fmt: skip
+    lines = train(settings, tmp_path, SILENT, command="test")
+    assert lines[-1]["validation"]["finished"] == 1.0
+    result = run_case({"agent": str(tmp_path / "policy.json"), "trajectory": "random-1"})
+    assert result["end"] == "finished"
+    assert result["metrics"]["ale"] < 0.3
+
+
+def test_a_training_starts_from_a_policy_and_does_not_lose_it_at_once(tmp_path: Path) -> None:
+    start = trained_clone(tmp_path / "clone")
+    settings = tiny("ppo", start=str(start))
+    other_layers = {"hidden": [64], **TINY["ppo"]["hyperparameters"]}
+    zero = {"origin": "zero", **TINY["ppo"]["hyperparameters"]}
+    trainer = make_trainer(settings, load_paths(settings), Logger(None, []))
+    before = read_policy(start)
+    for (weight, bias), (given, offset) in zip(
+        trainer.policy({}).layers, before.layers, strict=True
+    ):
+        np.testing.assert_array_equal(weight, given)
+        np.testing.assert_array_equal(bias, offset)
+    trainer.segment(0, silent)
+    np.testing.assert_array_equal(trainer.policy({}).layers[0][0], before.layers[0][0])
+    trainer.segment(1, silent)
+    assert (trainer.policy({}).layers[0][0] != before.layers[0][0]).any()
+    for changes, said in (
+        ({"hyperparameters": other_layers}, "hidden layers"),
+        ({"hyperparameters": zero}, "origin of actions"),
+        ({"vehicle": "course-car"}, "features or range"),
+        ({"preview_period": 0.1}, "preview period"),
+        ({"preview_steps": 30}, "preview steps"),
+    ):
+        other = tiny("ppo", start=str(start), **changes)
+        with pytest.raises(ValueError, match=said):
+            make_trainer(other, load_paths(other), Logger(None, []))
+    with pytest.raises(ValueError, match="squashing"):
+        make_trainer(
+            tiny("sac", start=str(start), hyperparameters={"activation": "tanh"}),
+            load_paths(settings), Logger(None, []),
+        )  # fmt: skip
+
+
+class Payload:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.marker,)
+
+
+def test_a_checkpoint_that_would_run_code_is_refused(tmp_path: Path) -> None:
+    marker, file = tmp_path / "ran", tmp_path / "checkpoint.pt"
+    torch.save({"format": checkpoint.FORMAT, "trainer": Payload(marker)}, file)
+    with pytest.raises(ValueError, match="cannot be read") as caught:
+        checkpoint.read(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert not marker.exists()
+    torch.load(file, weights_only=False)
+    assert marker.exists()
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
+    assert checkpoint.read(tmp_path) is None
+    checkpoint.write(tmp_path, {"trainer": {"network": torch.arange(100)}, "lines": []})
+    kept = checkpoint.read(tmp_path)
+    assert kept is not None
+    assert kept["trainer"]["network"].tolist() == list(range(100))
+    whole = (tmp_path / "checkpoint.pt").read_bytes()
+    for size in (0, 1, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "checkpoint.pt").write_bytes(whole[:size])
+        with pytest.raises(ValueError, match="cannot be read"):
+            checkpoint.read(tmp_path)
+    buffer = io.BytesIO()
+    torch.save({"format": "lpv-track-checkpoint/0"}, buffer)
+    (tmp_path / "checkpoint.pt").write_bytes(buffer.getvalue())
+    with pytest.raises(ValueError, match="checkpoint/0"):
+        checkpoint.read(tmp_path)
+
+
+def command(*words: str) -> int:
+    return cli.main(["train", *words])
+
+
+def test_the_command_trains_resumes_and_refuses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = str(tmp_path / "out")
+    words = [
+        "bc", "--steps", "512", "--segment", "256", "--envs", "16", "--paths", "1", "--set",
+        "round=16", "updates=5", "--out", out,
+    ]  # fmt: skip
+    assert command(*words) == 0
+    said = capsys.readouterr().out
+    assert "512 steps" in said
+    assert "m  best\n" in said
+    assert (tmp_path / "out" / "training.png").read_bytes().startswith(b"\x89PNG")
+    again = read_policy(tmp_path / "out" / "policy.json").training["command"]
+    assert again == (
+        "lpv-track train bc --steps 512 --seed 0 --paths 1 --envs 16 --segment 256 "
+        "--set round=16 updates=5"
+    )
+    assert command(*words) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert command(*words, "--resume") == 0
+    assert command(*words, "--resume", "--seed", "1") == 2
+    assert "seed is 1, there 0" in capsys.readouterr().err
+    for bad, told in (
+        (["--steps", "0.5"], "whole number"), (["--hours", "-1"], "--hours"),
+        (["--trajectories", "T1"], "evaluation"), (["--fast"], "ppo"),
+        (["--set", "rounds=3"], "round"), (["--from", "none.json"], "none.json"),
+        (["--device", "abacus"], "--device cpu"), (["--device", "cuda:99"], "--device cpu"),
+        (["--conditions-set", "friction=0.5"], "--conditions"),
+    ):  # fmt: skip
+        assert command(*words[:-1], str(tmp_path / "other"), *bad) == 2, bad
+        error = capsys.readouterr().err
+        assert told in error
+        assert error.count("\n") == 1
+
+
+def test_hours_become_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert command(
+        "bc", "--hours", "0.0005", "--segment", "256", "--envs", "16", "--paths", "1", "--set",
+        "round=16", "updates=5", "--out", str(out),
+    ) == 0  # fmt: skip
+    assert "steps a second" in capsys.readouterr().out
+    training = read_policy(out / "policy.json").training
+    steps = json.loads((out / "settings.json").read_text())["steps"]
+    assert f"--steps {steps}" in training["command"]
+
+
+def test_the_best_policy_on_validation_is_kept(tmp_path: Path) -> None:
+    kept = run(tiny("bc"), tmp_path)
+    losses = [line["validation"]["loss"] for line in kept["lines"]]
+    best = int(np.argmin(losses))
+    policy = read_policy(tmp_path / "policy.json")
+    assert policy.training["validation"]["loss"] == min(losses)
+    assert policy.training["kept_at"] == kept["lines"][best]["steps"]
+    assert policy.training["steps"] == kept["lines"][-1]["steps"]
+    assert [line["best"] for line in kept["lines"]][best]
+    # The weights are those that were validated then.
+    assert validate(tiny("bc"), tmp_path / "policy.json") == policy.training["validation"]
+    assert not list(tmp_path.glob("candidate*"))
+
+
+def test_a_training_outlives_the_file_that_it_started_from(tmp_path: Path) -> None:
+    start = tmp_path / "start" / "policy.json"
+    train(tiny("bc", steps=256, segment=256), start.parent, SILENT, command="first")
+
+    def take_away(line: dict[str, Any]) -> None:
+        start.unlink(missing_ok=True)
+
+    train(tiny("ppo", start=str(start)), tmp_path / "out",
+          Listener(silent, silent, take_away), command="second")  # fmt: skip
+    training = read_policy(tmp_path / "out" / "policy.json").training
+    assert (training["start"], training["command"]) == ("first", "second")
+    assert training["steps"] == 768 + 256
+
+
+def test_what_fails_leaves_no_thread_behind(tmp_path: Path) -> None:
+    def full(line: dict[str, Any]) -> None:
+        raise OSError("no space left on device")
+
+    before = threading.active_count()
+    with pytest.raises(OSError, match="no space"):
+        train(tiny("ppo"), tmp_path, Listener(silent, silent, full), command="test")
+    assert threading.active_count() == before
+
+
+def test_a_file_that_changed_is_another_training(tmp_path: Path) -> None:
+    car = tmp_path / "mine.json"
+    car.write_text(json.dumps(VEHICLES["m2-minibus"].as_dict()))
+    settings = tiny("bc", vehicle=str(car))
+    stored = settings.as_dict()
+    assert list(stored["files"]) == [str(car)]
+    assert difference(settings, stored) is None
+    car.write_text(json.dumps(VEHICLES["course-car"].as_dict()))
+    assert "files is" in str(difference(settings, stored))
+
+
+def test_one_process_trains_in_a_folder(tmp_path: Path) -> None:
+    with alone_in(tmp_path), pytest.raises(ValueError, match="another process trains"):
+        run(tiny("bc"), tmp_path)
+    assert len(run(tiny("bc"), tmp_path)["lines"]) == 3
+
+
+def test_the_help_names_every_hyperparameter(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        command("--help")
+    said = " ".join(capsys.readouterr().out.split())
+    assert sorted(options.ALGORITHMS) == sorted(ALGORITHMS)
+    for algorithm, defaults in HYPERPARAMETERS.items():
+        assert algorithm in said
+        for name in defaults:
+            assert name in said
+
+
+def test_without_the_extra_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = importlib.util.find_spec
+    lacking = {"stable_baselines3", "tensorboard"}
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name in lacking else found(name)
+    )
+    assert command("ppo", "--out", str(tmp_path)) == 2
+    error = capsys.readouterr().err
+    assert "stable_baselines3, tensorboard: pip install 'lpv-track-env[rl]'" in error
+    assert error.count("\n") == 1
