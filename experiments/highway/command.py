@@ -11,9 +11,9 @@ from rich.table import Table
 
 from agents.registry import check_settings
 from experiments.highway.drives import OWN, TrafficDrive, run_drive
-from experiments.report.failures import rate_interval
 from experiments.run.benchmark import parse_settings, progress_bar
 from experiments.run.engines import local_pool
+from experiments.run.statistics import rate_interval
 from experiments.run.store import ResultStore
 from lpv_track_env import conditions
 from lpv_track_env.highway import scenes

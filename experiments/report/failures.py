@@ -3,13 +3,12 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from scipy.stats import binomtest
-
 from experiments.report.document import Document, first_open, joined, paragraph
 from experiments.report.drives import family_of, main_family
 from experiments.report.html_tables import html_table
 from experiments.run import tables
-from experiments.run.tables import CONFIDENCE, Result
+from experiments.run.statistics import rate_interval
+from experiments.run.tables import Result
 
 HEADINGS = (
     "agent", "drives", "whole path", "left the corridor", "other ends", "failed cases",
@@ -23,18 +22,6 @@ NOTE = (
     "computations that landed late in the simulated vehicle; a vehicle brakes by itself when it "
     "gets no command in time."
 )
-
-
-def rate_interval(count: int, total: int) -> tuple[float, float]:
-    """Clopper-Pearson 95 % interval, two-sided, of a rate of which `count` of `total` were seen.
-
-    Raises
-    ------
-    ValueError
-        Unless 0 <= count <= total and total is at least 1.
-    """
-    found = binomtest(count, total).proportion_ci(CONFIDENCE, method="exact")
-    return float(found.low), float(found.high)
 
 
 def failures_section(document: Document, cases: Sequence[Result]) -> str:

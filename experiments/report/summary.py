@@ -8,9 +8,9 @@ import numpy as np
 
 from experiments.report.document import Document, first_open, joined, paragraph
 from experiments.report.drives import LEAD, family_of, main_family
-from experiments.report.failures import rate_interval
 from experiments.report.html_tables import html_table
 from experiments.run import published, tables
+from experiments.run.statistics import rate_interval
 from experiments.run.tables import Estimate, Result, estimate
 
 HEADINGS = (

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from agents.weight_tuning.score import failed
 from experiments.robustness.switching import CONTROL, WHOLE, Outcome
-from experiments.run.statistics import failure_bound
+from experiments.run.statistics import rate_bound
 from lpv_track_env import kernels as k
 
 Array = NDArray[Any]
@@ -32,7 +32,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "episodes": episodes,
         "lost": failures,
         "lost_seeds": outcome.seeds[lost].tolist(),
-        "lost_upper_bound": failure_bound(failures, episodes),
+        "lost_upper_bound": rate_bound(failures, episodes),
         "ends": dict(ends),
         "not_finite": int(outcome.not_finite.sum()),
         "periods": int(outcome.steps.sum()),

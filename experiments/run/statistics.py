@@ -78,16 +78,25 @@ def _resampled(trainings: int, paths: int, seed: int) -> tuple[Array, Array]:
     return rows, random.integers(paths, size=(RESAMPLES, 1, paths))
 
 
-def failure_bound(failures: int, drives: int) -> float:
-    """Clopper-Pearson upper bound (95 %, one-sided) on the rate of failures.
+def rate_interval(
+    count: int, total: int, *, tail: float = (1.0 - CONFIDENCE) / 2
+) -> tuple[float, float]:
+    """Compute the Clopper-Pearson interval of a rate of which `count` of `total` were seen.
+
+    The true rate lies below the interval with probability at most `tail`, and above it likewise.
 
     Raises
     ------
     ValueError
-        Unless 0 <= failures <= drives and there is a drive.
+        Unless 0 <= count <= total and total is at least 1.
     """
-    if not 0 <= failures <= drives or drives < 1:
-        raise ValueError(f"{failures} failures of {drives} drives make no rate")
-    if failures == drives:
-        return 1.0
-    return float(beta.ppf(CONFIDENCE, failures + 1, drives - failures))
+    if not 0 <= count <= total or total < 1:
+        raise ValueError(f"{count} of {total} make no rate")
+    low = 0.0 if count == 0 else float(beta.ppf(tail, count, total - count + 1))
+    high = 1.0 if count == total else float(beta.ppf(1.0 - tail, count + 1, total - count))
+    return low, high
+
+
+def rate_bound(count: int, total: int) -> float:
+    """Compute the one-sided Clopper-Pearson upper bound (95 %) on a rate."""
+    return rate_interval(count, total, tail=1.0 - CONFIDENCE)[1]

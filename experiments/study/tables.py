@@ -11,10 +11,10 @@ from agents.weight_tuning.score import COMFORT, PARTS, TRACKING
 from experiments.run.band_metrics import BANDS
 from experiments.run.statistics import (
     Interval,
-    failure_bound,
     interquartile_mean,
     mean_interval,
     paired_gain,
+    rate_bound,
 )
 from experiments.study.evaluation import IN_BANDS
 from experiments.study.ladder import Rung, baseline_of, rung
@@ -97,7 +97,7 @@ def ladder_lines(rows: Sequence[Judged], headroom: float | None) -> Lines:
                 "–" if gain is None else f"{gain.low:+.1%} to {gain.high:+.1%}",
                 share,
                 f"{row.failures} of {row.drives}",
-                f"{failure_bound(row.failures, row.drives):.2%}",
+                f"{rate_bound(row.failures, row.drives):.2%}",
                 f"{row.violated:.2%}",
             ]
         )

@@ -31,7 +31,7 @@ from experiments.robustness.switching import (
     arms_of,
     drive_arm,
 )
-from experiments.run.statistics import failure_bound
+from experiments.run.statistics import rate_bound
 from lpv_track_env import kernels as k
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import CurvatureBands
@@ -182,14 +182,14 @@ def test_lost_vehicles_are_lost_once_and_what_failed_is_counted() -> None:
 def test_the_bound_is_the_rate_at_which_so_few_failures_are_improbable(
     failures: int, episodes: int
 ) -> None:
-    bound = failure_bound(failures, episodes)
+    bound = rate_bound(failures, episodes)
     assert binom.cdf(failures, episodes, bound) == pytest.approx(0.05, rel=1e-9)
 
 
 def test_the_bound_of_none_kept_is_one_and_of_none_lost_the_rule_of_three() -> None:
-    assert failure_bound(5, 5) == 1.0
-    assert failure_bound(0, 2000) == pytest.approx(1.0 - 0.05 ** (1 / 2000), rel=1e-12)
-    assert failure_bound(0, 2000) == pytest.approx(3.0 / 2000, rel=0.01)
+    assert rate_bound(5, 5) == 1.0
+    assert rate_bound(0, 2000) == pytest.approx(1.0 - 0.05 ** (1 / 2000), rel=1e-12)
+    assert rate_bound(0, 2000) == pytest.approx(3.0 / 2000, rel=0.01)
 
 
 def test_weights_before_a_loss() -> None:

@@ -11,7 +11,7 @@ from agents.weight_tuning.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.score import scores_of
 from agents.weights import TrackingWeights
 from experiments.run import statistics
-from experiments.run.statistics import failure_bound, interquartile_mean, mean_interval, paired_gain
+from experiments.run.statistics import interquartile_mean, mean_interval, paired_gain, rate_bound
 from experiments.study import oracle
 from experiments.study.evaluation import EvaluationSet
 from experiments.study.oracle import greedy, headroom, loop_of, pool_of, scores_of_pool, varied
@@ -75,16 +75,16 @@ def test_intervals_cover_the_truth_as_often_as_they_say(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(("failures", "drives"), [(0, 1), (0, 300), (1, 10), (7, 40), (40, 40)])
-def test_failure_bounds_are_clopper_and_pearsons(failures: int, drives: int) -> None:
+def test_rate_bounds_are_clopper_and_pearsons(failures: int, drives: int) -> None:
     exact = binomtest(failures, drives, alternative="less").proportion_ci(0.95, method="exact")
-    assert failure_bound(failures, drives) == pytest.approx(exact.high, rel=1e-12)
+    assert rate_bound(failures, drives) == pytest.approx(exact.high, rel=1e-12)
 
 
 def test_failures_that_make_no_rate_are_refused() -> None:
-    assert failure_bound(0, 300) == pytest.approx(1.0 - 0.05 ** (1 / 300))
+    assert rate_bound(0, 300) == pytest.approx(1.0 - 0.05 ** (1 / 300))
     for failures, drives in ((-1, 3), (4, 3), (0, 0)):
         with pytest.raises(ValueError, match="make no rate"):
-            failure_bound(failures, drives)
+            rate_bound(failures, drives)
 
 
 # What an oracle could gain -----------------------------------------------------------------------
