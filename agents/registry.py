@@ -1,6 +1,5 @@
 """Agents by name; a name's module is imported only when it is made."""
 
-import difflib
 import importlib
 import importlib.util
 import inspect
@@ -14,6 +13,7 @@ from typing import Any
 import gymnasium
 
 from agents.base import Agent, DrivingTask
+from trajectories.naming import suggestion
 
 REGISTRY: dict[str, str] = {
     "lpv-nmpc": "agents.nmpc.rti_agent:RtiNmpc",
@@ -63,9 +63,8 @@ def agent_class(name: str) -> Callable[..., Any]:
     target = REGISTRY.get(name, name)
     module, separator, attribute = target.rpartition(":")
     if not separator:
-        nearest = difflib.get_close_matches(name, REGISTRY, n=1, cutoff=0.0)[0]
         raise ValueError(
-            f"unknown agent {name!r}; known: {', '.join(REGISTRY)} (nearest: {nearest}), "
+            f"unknown agent {name!r}; {suggestion(name, REGISTRY)}, "
             "or give your own as file.py:Class or module:Class, a learned policy as its .json"
         )
     try:
@@ -132,8 +131,7 @@ def check_settings(name: str, settings: Iterable[str]) -> None:
     known = [parameter.name for parameter in parameters]
     for key in settings:
         if key not in (*known, *COMMON):
-            nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
-            hint = f"; known: {', '.join(known)} (nearest: {nearest[0]})" if nearest else ""
+            hint = f"; {suggestion(key, known)}" if known else ""
             raise ValueError(f"agent {name!r} has no setting {key!r}{hint}")
 
 

@@ -87,7 +87,7 @@ def _verify(options: argparse.Namespace, console: Any) -> int:
 def _benchmark(options: argparse.Namespace, console: Any) -> int:
     from experiments.run import suites
     from experiments.run.benchmark import distinct, finish, parse_settings, run_benchmark
-    from lpv_track_env.naming import choose
+    from trajectories.naming import choose
 
     if options.seeds < 1:
         raise ValueError(f"--seeds must be at least 1, not {options.seeds}")

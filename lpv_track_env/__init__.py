@@ -21,7 +21,6 @@ _SUBMODULES = (
     "integration",
     "kernels",
     "lpv",
-    "naming",
     "observation",
     "plants",
     "rendering",

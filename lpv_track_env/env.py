@@ -18,7 +18,6 @@ from lpv_track_env.conditions import load as load_conditions
 from lpv_track_env.conditions.layout import ConditionsArrays
 from lpv_track_env.draws import random_key
 from lpv_track_env.episodes import given_start
-from lpv_track_env.naming import choose
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.plants.episode import PlantEpisode
 from lpv_track_env.reward import TERMS, RewardWeights
@@ -28,6 +27,7 @@ from lpv_track_env.vehicle import VehicleParameters
 from lpv_track_env.vehicle import load as load_vehicle
 from trajectories import ReferencePath
 from trajectories.compilation import entry_point
+from trajectories.naming import choose
 
 if TYPE_CHECKING:
     from lpv_track_env.rendering import Renderer

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 import trajectories
 from lpv_track_env.bicycle import longest_substep
 from lpv_track_env.conditions import Conditions
-from lpv_track_env.naming import choose
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
+from trajectories.naming import choose
 from trajectories.projection import tightest_turn
 from trajectories.speed import constant_speed
 

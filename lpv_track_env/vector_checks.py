@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from lpv_track_env import vector_kernels
-from lpv_track_env.naming import choose
+from trajectories.naming import choose
 
 Array = NDArray[Any]
 

@@ -18,7 +18,6 @@ from lpv_track_env.conditions.vector import ConditionsVector
 from lpv_track_env.draws import random_key
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.episodes import GIVEN, given_start
-from lpv_track_env.naming import choose
 from lpv_track_env.plants import BICYCLE
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task, action_space
@@ -33,6 +32,7 @@ from lpv_track_env.vector_checks import (
 from lpv_track_env.vector_infos import episode_infos, final_infos, single_info
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
+from trajectories.naming import choose
 
 Array = NDArray[Any]
 Infos = dict[str, Any]

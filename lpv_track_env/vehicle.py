@@ -1,7 +1,6 @@
 """Vehicle parameters, limits and presets, each number with its source."""
 
 import dataclasses
-import difflib
 import json
 import math
 from dataclasses import dataclass
@@ -10,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from trajectories.naming import suggestion
 
 GRAVITY = 9.81  # m/s^2
 
@@ -286,9 +287,8 @@ def load(vehicle: str | Path | VehicleParameters) -> VehicleParameters:
     path = Path(vehicle)
     if path.suffix == ".json":
         return _read(path)
-    nearest = difflib.get_close_matches(str(vehicle), VEHICLES, n=1, cutoff=0.0)[0]
     raise ValueError(
-        f"unknown vehicle {str(vehicle)!r}; known: {', '.join(VEHICLES)} (nearest: {nearest}), "
+        f"unknown vehicle {str(vehicle)!r}; {suggestion(vehicle, VEHICLES)}, "
         "or give a .json file with the fields of VehicleParameters"
     )
 

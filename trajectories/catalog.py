@@ -1,6 +1,5 @@
 """Named trajectories: the paper's six (drivable and raw), analytic shapes, random paths, files."""
 
-import difflib
 import math
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from trajectories import shapes
 from trajectories.curvature import PathStatistics, signed_waypoint_curvature
+from trajectories.naming import suggestion
 from trajectories.path import SPACING, ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
 
@@ -119,11 +119,8 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
         from trajectories.files import read
 
         return read(Path(name))
-    nearest = difflib.get_close_matches(name, names(), n=1, cutoff=0.0)[0]
-    raise ValueError(
-        f"unknown trajectory {name!r}; known: {', '.join(names())} and both with any other seed "
-        f"(nearest: {nearest}), or give a .csv file"
-    )
+    known = suggestion(name, names(), " and both with any other seed")
+    raise ValueError(f"unknown trajectory {name!r}; {known}, or give a .csv file")
 
 
 @lru_cache(maxsize=256)

@@ -9,9 +9,9 @@ from typing import Any, Literal, NoReturn, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lpv_track_env.naming import choose
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.task import checked_period
+from trajectories.naming import choose
 
 Weights = NDArray[np.float32]
 Array = NDArray[np.float64]

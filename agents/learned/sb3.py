@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agents.learned.policy import Activation, Layer, Origin, Policy, Squash
-from lpv_track_env.naming import choose
 from lpv_track_env.observation import ObservationLayout
+from trajectories.naming import choose
 
 ALGORITHMS = ("ppo", "sac", "td3")
 ACTIVATIONS: dict[str, Activation] = {"Tanh": "tanh", "ReLU": "relu"}

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from agents.base import DrivingTask
 from agents.learned.policy import ORIGINS, Origin
-from lpv_track_env.naming import choose
 from lpv_track_env.observation import PREVIEW_BOUNDS, SCALARS
 from lpv_track_env.vehicle import VehicleParameters
+from trajectories.naming import choose
 
 Array = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from agents.nmpc.rti_solver import RtiSolver
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.bicycle import PSI, VX, VY, X, Y
 from lpv_track_env.lpv import matrices
-from lpv_track_env.naming import choose
 from lpv_track_env.vehicle import VehicleParameters
+from trajectories.naming import choose
 
 Array = NDArray[np.float64]
 

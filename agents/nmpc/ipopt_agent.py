@@ -14,9 +14,9 @@ from agents.nmpc.fatrop_solver import FatropSolver
 from agents.nmpc.problem import Solution, Status
 from agents.nmpc.schedule import NO_BAND, WEIGHTS
 from agents.weights import TrackingWeights, WeightSchedule
-from lpv_track_env.naming import choose
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.vehicle import VehicleParameters
+from trajectories.naming import choose
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from agents.learned.policy import checked_number
 from agents.nmpc.schedule import rules_of
 from agents.weight_tuning.features import TUNED
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
-from lpv_track_env.naming import choose
 from trajectories import CurvatureBands
 from trajectories.compilation import compiled
+from trajectories.naming import choose
 
 Array = NDArray[Any]
 

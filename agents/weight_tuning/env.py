@@ -12,9 +12,9 @@ from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.vector_env import WeightTuningVectorEnv
 from lpv_track_env.conditions import Conditions
 from lpv_track_env.env import RESET_OPTIONS
-from lpv_track_env.naming import choose
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
+from trajectories.naming import choose
 
 Array = NDArray[Any]
 

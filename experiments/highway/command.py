@@ -18,7 +18,7 @@ from experiments.run.store import ResultStore
 from lpv_track_env import conditions
 from lpv_track_env.highway import scenes
 from lpv_track_env.highway.env import HighwayTrackEnv
-from lpv_track_env.naming import choose
+from trajectories.naming import choose
 
 ENV_SETTINGS = tuple(
     parameter.name

@@ -11,7 +11,7 @@ from agents.registry import check_settings
 from lpv_track_env import vehicle
 from lpv_track_env.conditions import IDEAL, Conditions, load
 from lpv_track_env.env import PathTrackingEnv
-from lpv_track_env.naming import choose
+from trajectories.naming import choose
 
 MS = 1_000_000
 """ns."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from experiments.ros.messages import CODECS, ROS1, ROS2, require_rosbags, serialise, typestore
 from experiments.ros.topics import SECOND, Datum, Topic
-from lpv_track_env.naming import choose
+from trajectories.naming import choose
 
 FORMATS = {"ros1": ROS1, "ros2": ROS2}
 STORAGES = ("sqlite3", "mcap")

@@ -23,11 +23,11 @@ from experiments.run.computing import ComputingTimes
 from experiments.run.rollout import Rollout, rollout
 from lpv_track_env import conditions, plants, vehicle
 from lpv_track_env.env import PathTrackingEnv
-from lpv_track_env.naming import choose
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import SPEED_MODES
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.compilation import source_digest
+from trajectories.naming import choose
 
 VEHICLE_FIELDS = tuple(field.name for field in fields(VehicleParameters))
 REWARD_FIELDS = tuple(field.name for field in fields(RewardWeights))

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lpv_track_env.conditions import LONGEST_DELAY
-from lpv_track_env.naming import choose
+from trajectories.naming import choose
 
 Array = NDArray[np.float64]
 

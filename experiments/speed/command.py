@@ -36,8 +36,8 @@ from experiments.speed import (
 )
 from experiments.speed.figures import picture
 from experiments.speed.measure import FULL, QUICK, Effort, Section, Tick
-from lpv_track_env.naming import choose
 from trajectories.atomic import write_atomically
+from trajectories.naming import choose
 
 FORMAT = "lpv-track-speed/1"
 Measure = Callable[[Section, Effort, Tick], None]

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from agents.learned.policy import ACTIVATIONS, ORIGINS
-from lpv_track_env.naming import choose
+from trajectories.naming import choose
 
 PPO = {
     "learning_rate": 1e-3, "last_learning_rate": 2e-5, "rollout": 32, "batch": 4096, "epochs": 4,

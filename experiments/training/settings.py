@@ -11,8 +11,8 @@ from typing import Any
 from experiments.run.suites import HELD_OUT, SIX
 from experiments.training.hyperparameters import ALGORITHMS, complete
 from lpv_track_env import conditions, vehicle
-from lpv_track_env.naming import choose
 from lpv_track_env.reward import RewardWeights
+from trajectories.naming import choose
 
 ENVS = {"ppo": 512, "residual": 256, "sac": 64, "td3": 64, "bc": 256}
 STEPS = {

@@ -14,7 +14,7 @@ from experiments.run.suites import HELD_OUT, SIX
 from experiments.training.hyperparameters import LEAST, MOST
 from experiments.training.settings import MOST_PATHS
 from lpv_track_env import conditions, vehicle
-from lpv_track_env.naming import choose
+from trajectories.naming import choose
 
 METHODS: dict[str, str] = {
     "fixed": "the default weights, nothing tuned",

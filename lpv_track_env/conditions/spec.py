@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.estimation.estimator import EstimatorSettings
-from lpv_track_env.naming import choose
+from trajectories.naming import choose
 
 Array = NDArray[np.float64]
 Range = float | tuple[float, float]

@@ -20,11 +20,11 @@ from lpv_track_env.highway.cruise import CruiseControl
 from lpv_track_env.highway.ego import EgoVehicle
 from lpv_track_env.highway.reference import TrafficReference
 from lpv_track_env.highway.traffic import others_on
-from lpv_track_env.naming import choose
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task
 from lpv_track_env.vehicle import VehicleParameters
 from lpv_track_env.vehicle import load as load_vehicle
+from trajectories.naming import choose
 from trajectories.speed import SpeedLimits
 
 SURROUNDINGS: dict[str, dict[str, Any]] = {

@@ -30,8 +30,8 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 from lpv_track_env.highway import routes
-from lpv_track_env.naming import choose
 from trajectories import ReferencePath
+from trajectories.naming import choose
 from trajectories.speed import SpeedLimits
 
 SIMULATION_PERIOD = 1.0 / 15.0

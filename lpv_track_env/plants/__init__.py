@@ -24,8 +24,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lpv_track_env.naming import choose
 from lpv_track_env.vehicle import VehicleParameters
+from trajectories.naming import choose
 
 Array = NDArray[np.float64]
 

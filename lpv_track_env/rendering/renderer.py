@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from lpv_track_env import kernels
 from lpv_track_env.bicycle import VX, VY, YAW_RATE, X, Y
-from lpv_track_env.naming import choose
 from lpv_track_env.rendering.camera import Camera
 from lpv_track_env.rendering.charts import Charts, signals_of
 from lpv_track_env.rendering.forces import axle_forces
@@ -42,6 +41,7 @@ from lpv_track_env.rendering.vehicles import VehicleDrawing, draw_others
 from lpv_track_env.rendering.view import View, polyline
 from lpv_track_env.rendering.window import Window
 from lpv_track_env.task import Task
+from trajectories.naming import choose
 
 Array = NDArray[np.float64]
 

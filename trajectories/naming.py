@@ -1,0 +1,24 @@
+"""Look up a name in a list, and name the nearest one if it is unknown."""
+
+import difflib
+from collections.abc import Iterable
+
+
+def choose(kind: str, value: str, known: tuple[str, ...]) -> str:
+    """Return `value` if it is known.
+
+    Raises
+    ------
+    ValueError
+        If it is not, listing the known names of this `kind` and the nearest.
+    """
+    if value in known:
+        return value
+    raise ValueError(f"unknown {kind} {value!r}; {suggestion(value, known)}")
+
+
+def suggestion(value: object, known: Iterable[str], more: str = "") -> str:
+    """Second half of an error message: the known names, `more` after them, and the nearest."""
+    names = tuple(known)
+    nearest = difflib.get_close_matches(str(value), names, n=1, cutoff=0.0)[0]
+    return f"known: {', '.join(names)}{more} (nearest: {nearest})"
