@@ -1,10 +1,18 @@
-"""Colours of all figures, and the style of those that commands draw with Matplotlib."""
+"""Colours and style of all figures, and saving of those drawn with Matplotlib."""
 
-from typing import Any
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from trajectories.atomic import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5195")
-"""Okabe and Ito's colour-blind-safe set (jfly.uni-koeln.de/color) less black and yellow, a violet
-added; reports have the same hues as `c0` to `c6`, each in a shade for light and one for dark."""
+"""Okabe and Ito's colour-blind-safe set (jfly.uni-koeln.de/color) without black and yellow, plus a
+violet; reports use the same hues as `c0` to `c6`, with one shade for light and one for dark."""
 STYLE: dict[str, Any] = {
     "svg.fonttype": "none",
     "font.family": "sans-serif",
@@ -22,3 +30,28 @@ STYLE: dict[str, Any] = {
     "path.simplify": True,
     "path.simplify_threshold": 0.2,
 }
+DPI = 110.0
+
+
+def save_figure(figure: "Figure", file: Path) -> None:
+    """Write a figure atomically, in the format of the file's suffix (.png, .svg, .pdf).
+
+    Raises
+    ------
+    ValueError
+        If Matplotlib does not know the format.
+    OSError
+        If the file cannot be written.
+    """
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=DPI, format=file.suffix.removeprefix(".") or "png")
+    write_atomically(file, buffer.getvalue())
+
+
+def plain_ticks(axis: "Axis", multiples: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
+    """Label a logarithmic axis with plain numbers at `multiples` of every power of ten."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=multiples))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())

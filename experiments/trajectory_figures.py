@@ -1,19 +1,17 @@
 """Published against achieved rows of trajectories, and a figure of their paths."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from experiments.figures import save_figure
 from trajectories import PUBLISHED, ReferencePath, statistics
-from trajectories.atomic import write_atomically
 
 ROWS = (
     ("max_speed", "max speed", "m/s", ".2f"),
@@ -62,7 +60,6 @@ def draw(paths: Sequence[ReferencePath], file: str | Path) -> None:
     """
     colours = Normalize(0.0, max(float(path.speed.max()) for path in paths))
     figure = Figure(figsize=(12.0, 2.6 * len(paths)), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2 * len(paths), 2, width_ratios=(1.0, 1.5))
     plans = []
     for k, path in enumerate(paths):
@@ -84,9 +81,7 @@ def draw(paths: Sequence[ReferencePath], file: str | Path) -> None:
     figure.colorbar(
         plans[0].collections[0], ax=plans, location="left", shrink=0.5, label="speed (m/s)"
     )
-    file, buffer = Path(file), io.BytesIO()
-    figure.savefig(buffer, dpi=110, format=file.suffix.removeprefix(".") or "png")
-    write_atomically(file, buffer.getvalue())
+    save_figure(figure, Path(file))
 
 
 def _draw_plan(axes: Axes, path: ReferencePath, colours: Normalize) -> None:

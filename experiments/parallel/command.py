@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 
 import trajectories
+from experiments.figures import save_figure
 from experiments.parallel.bench import bench_mailbox
 from experiments.parallel.figures import picture
 from experiments.parallel.recording import Outcome
@@ -50,7 +51,7 @@ def run_parallel(setup: Setup, folder: Path, console: Console) -> int:
     write(result, folder / RUN_FILE)
     drawn = picture(setup, outcome, summary, trajectories.load(setup.trajectory))
     if drawn is not None:
-        write_atomically(folder / "run.png", drawn)
+        save_figure(drawn, folder / "run.png")
         console.print(table(setup, summary))
     for line in sentences(summary):
         say(line)

@@ -1,11 +1,8 @@
 """`run.png`: latencies, path and errors of a parallel run."""
 
-import io
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
@@ -17,14 +14,13 @@ from lpv_track_env.bicycle import VX, X, Y
 from trajectories import ReferencePath
 
 
-def picture(setup: Setup, outcome: Outcome, summary: Summary, path: ReferencePath) -> bytes | None:
-    """PNG with four panels; None of a run that never began."""
+def picture(setup: Setup, outcome: Outcome, summary: Summary, path: ReferencePath) -> Figure | None:
+    """Draw four panels; None for a run that never began."""
     recording = outcome.recording
     if len(recording.rows) < 2:
         return None
     driven = recording.driven()
     figure = Figure(figsize=(13.0, 8.5), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(2, 2)
     _latencies(panels[0, 0], setup, recording)
     _distribution(panels[0, 1], setup, recording)
@@ -35,9 +31,7 @@ def picture(setup: Setup, outcome: Outcome, summary: Summary, path: ReferencePat
         f"{setup.conditions_name}; {summary['rate']:.2f} of {setup.rate} Hz, "
         f"{summary['deadline_misses']} deadline misses; end: {outcome.end}"
     )
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
-    return buffer.getvalue()
+    return figure
 
 
 def _latencies(ax: Axes, setup: Setup, recording: Recording) -> None:

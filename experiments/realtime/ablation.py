@@ -1,6 +1,5 @@
 """`lpv-track ablation`: each disturbance alone and its cost, and what helps against all of them."""
 
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,8 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from experiments.figures import COLOURS
-from experiments.realtime.axes import plain_ticks
+from experiments.figures import COLOURS, plain_ticks, save_figure
 from experiments.run.benchmark import run_benchmark, selected, tell_failed
 from experiments.run.store import revision, versions
 from experiments.run.suites import grid
@@ -106,7 +104,7 @@ def ablate(
     ]
     result = {**settings, "rows": rows, "revision": revision(), "versions": versions()}
     write_atomically(folder / "ablation.json", json.dumps(result, indent=1).encode())
-    write_atomically(folder / "ablation.png", picture(result))
+    draw(result, folder / "ablation.png")
     console.print(table(result))
     console.print(
         f"written: {folder / 'ablation.json'}, ablation.png",
@@ -157,14 +155,12 @@ def table(result: Mapping[str, Any]) -> Table:
     return shown
 
 
-def picture(result: Mapping[str, Any]) -> bytes:
-    """PNG: ALE of every row, with and without compensation; hatched where the road was left."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+def draw(result: Mapping[str, Any], file: Path) -> None:
+    """Draw ALE of every row, with and without compensation; hatched where the road was left."""
     from matplotlib.figure import Figure
 
     labels = list(dict.fromkeys(row["row"] for row in result["rows"]))
     figure = Figure(figsize=(9.0, 0.42 * len(labels) + 1.6), layout="constrained")
-    FigureCanvasAgg(figure)
     ax = figure.subplots()
     for offset, compensated, colour in ((-0.2, True, COLOURS[0]), (0.2, False, COLOURS[1])):
         rows = {row["row"]: row for row in result["rows"] if row["compensated"] is compensated}
@@ -181,11 +177,9 @@ def picture(result: Mapping[str, Any]) -> bytes:
     ax.set_yticks(range(len(labels)), labels)
     ax.invert_yaxis()
     ax.set_xscale("log")
-    plain_ticks(ax)
+    plain_ticks(ax.xaxis)
     ax.set_xlabel("ALE, m (hatched: some episodes left the road, so it says little)")
     ax.grid(visible=True, axis="x", alpha=0.3)
     ax.legend(loc="upper right")
     ax.set_title(f"{result['agent']}: each disturbance alone, and all of them")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    save_figure(figure, file)

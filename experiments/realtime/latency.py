@@ -8,7 +8,6 @@ second one, or is given a slower clock. How old a command's readings are does no
 with clocks of their own it gets worse.
 """
 
-import io
 import json
 import math
 import time
@@ -20,8 +19,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from experiments.figures import COLOURS
-from experiments.realtime.axes import plain_ticks
+from experiments.figures import COLOURS, plain_ticks, save_figure
 from experiments.run.benchmark import run_benchmark, selected, tell_failed
 from experiments.run.case import Case
 from experiments.run.computing import ARRANGEMENTS, ComputingTimes, quantiles
@@ -167,7 +165,7 @@ def compare(
         **settings, "times": recorded, "rows": rows, "revision": revision(), "versions": versions(),
     }  # fmt: skip
     write_atomically(folder / "latency.json", json.dumps(result, indent=1).encode())
-    write_atomically(folder / "latency.png", picture(result))
+    draw(result, folder / "latency.png")
     console.print(table(result))
     console.print(
         f"written: {folder / 'latency.json'}, latency.png; the same again with --times {kept}",
@@ -245,14 +243,12 @@ def table(result: Mapping[str, Any]) -> Table:
     return shown
 
 
-def picture(result: Mapping[str, Any]) -> bytes:
-    """PNG: latency, missed periods and ALE of every row and arrangement."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+def draw(result: Mapping[str, Any], file: Path) -> None:
+    """Draw latency, missed periods and ALE of every row and arrangement."""
     from matplotlib.figure import Figure
 
     labels = list(dict.fromkeys(row["row"] for row in result["rows"]))
     figure = Figure(figsize=(12.0, 4.8), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = (
         ("latency_median", 1e3, "latency, median, ms (line to p99)"),
         ("missed", 100.0, "periods missed, %"),
@@ -278,7 +274,7 @@ def picture(result: Mapping[str, Any]) -> bytes:
         ax.set_title(title)
         if key == "ale":
             ax.set_xscale("log")
-            plain_ticks(ax)
+            plain_ticks(ax.xaxis)
         ax.grid(visible=True, axis="x", alpha=0.3)
         ax.set_yticks(range(len(labels)), labels)
     figure.axes[0].invert_yaxis()
@@ -288,6 +284,4 @@ def picture(result: Mapping[str, Any]) -> bytes:
         "Estimation and control in one process (sequential) or two (triggered by the estimate, or "
         "free-running)"
     )
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    save_figure(figure, file)

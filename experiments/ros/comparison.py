@@ -1,22 +1,19 @@
 """A replay against what was recorded: figures for a table and JSON, and a drawing."""
 
-import io
 from pathlib import Path
 from typing import Any, cast
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 from rich.table import Table
 
-from experiments.figures import COLOURS, STYLE
+from experiments.figures import COLOURS, STYLE, save_figure
 from experiments.ros.replay import Replay
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
-from trajectories.atomic import write_atomically
 
 Array = NDArray[np.float64]
 
@@ -119,7 +116,6 @@ def draw(replay: Replay, file: Path) -> None:
     """Draw a replay as PNG: the plan, the estimate's error, both commands, the fixes' NIS."""
     with mpl.rc_context(cast("Any", STYLE)):
         figure = Figure(figsize=(12.0, 7.5), layout="constrained")
-        FigureCanvasAgg(figure)
         grid = figure.add_gridspec(4, 2)
         _draw_plan(figure.add_subplot(grid[:2, 0]), replay)
         acceleration = figure.add_subplot(grid[:2, 1])
@@ -139,9 +135,7 @@ def draw(replay: Replay, file: Path) -> None:
                 loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False,
                 borderaxespad=0.1,
             )  # fmt: skip
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=110)
-    write_atomically(file, buffer.getvalue())
+        save_figure(figure, file)
 
 
 def _draw_plan(axes: Axes, replay: Replay) -> None:

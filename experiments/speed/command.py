@@ -21,6 +21,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from experiments.figures import save_figure
 from experiments.run.interrupts import Interrupts
 from experiments.run.store import hardware, revision, versions
 from experiments.speed import (
@@ -115,7 +116,7 @@ def run_speed(
     _write(result, folder)
     drawn = picture(result)
     if drawn is not None:
-        write_atomically(folder / "speed.png", drawn)
+        save_figure(drawn, folder / "speed.png")
     tables.show(result, console)
     return result, bool(result["complete"])
 

@@ -1,16 +1,13 @@
 """`speed.png`: how times grow, from the contents of `speed.json` alone."""
 
-import io
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.figures import COLOURS
+from experiments.figures import COLOURS, plain_ticks
 from experiments.speed.tables import differing, label, leading, quantity
 
 Result = Mapping[str, Any]
@@ -18,8 +15,8 @@ MARKERS = "os^Dv<>P"
 DECADE = 10.0
 
 
-def picture(result: Result) -> bytes | None:
-    """PNG with a panel per section that scales or compares; None where nothing can be drawn."""
+def picture(result: Result) -> Figure | None:
+    """Figure with a panel per section that scales or compares; None where nothing can be drawn."""
     panels = [
         (section, draw)
         for name, draw in PANELS.items()
@@ -30,7 +27,6 @@ def picture(result: Result) -> bytes | None:
     columns = min(len(panels), 2)
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(7.0 * columns, 4.6 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for (section, draw), ax in zip(panels, axes, strict=False):
         draw(section, ax)
@@ -44,9 +40,7 @@ def picture(result: Result) -> bytes | None:
         f"lpv-track speed: {machine['processor']}, {machine['cores']} cores, {commit}; "
         "medians, bars from the least to the greatest round"
     )
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    return figure
 
 
 def _spread(series: list[Result], factor: float) -> tuple[list[float], list[list[float]]]:
@@ -99,9 +93,7 @@ def _plain(axis: Axis) -> None:
     """Plain numbers at 1, 2 and 5 of every decade of a logarithmic axis, or at more of a part."""
     low, high = axis.get_view_interval()
     subs = (1.0, 2.0, 5.0) if high > DECADE * low else tuple(range(1, 10))
-    axis.set_major_locator(LogLocator(subs=subs))
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(NullFormatter())
+    plain_ticks(axis, subs)
 
 
 def _doubling(ax: Axes, what: str) -> None:

@@ -1,23 +1,19 @@
 """The picture of a training: what validation said as it went on."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from matplotlib.ticker import EngFormatter
 
-from experiments.figures import COLOURS
-from trajectories.atomic import write_atomically
+from experiments.figures import COLOURS, save_figure
 
 
 def draw(lines: Sequence[dict[str, Any]], file: Path) -> None:
     """Draw ALE and steering of the validation drives over steps and seconds."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     steps = [line["steps"] for line in lines]
     for axes, key, label in (
@@ -37,6 +33,4 @@ def draw(lines: Sequence[dict[str, Any]], file: Path) -> None:
     )
     left.legend()
     figure.suptitle(f"{lines[-1]['seconds']:.0f} s, {lines[-1]['solves']:,} NMPC solves")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    write_atomically(file, buffer.getvalue())
+    save_figure(figure, file)
