@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from agents.reference import NODE_ARC_LENGTH, NODE_HEADING, NODE_SPEED, NODE_X, NODE_Y, fill_nodes
 from lpv_track_env.integration import integrate
-from lpv_track_env.kernels import PREVIEW_START, wrap
+from lpv_track_env.kernels import wrap
+from lpv_track_env.observation import PREVIEW_START
 from trajectories.compilation import compiled, compiled_internal
 
 Array = NDArray[Any]

@@ -207,8 +207,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _open_views(self) -> None:
         """Parts of the episode's array: to make a view costs as much as a copy."""
         data = self._episode_data
-        self._memory = data[kernels.MEMORY : kernels.CONSTANTS]
-        self._state = self._memory[:6]
+        self._record = data[kernels.RECORD : kernels.CONSTANTS]
+        self._state = self._record[:6]
         self._constants = data[kernels.CONSTANTS : kernels.OBSERVATION]
         self._observation = data[kernels.OBSERVATION :].view(np.float32)
         # Python numbers pass through a memoryview in half the time.
@@ -273,12 +273,12 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     @property
     def actuators(self) -> tuple[float, float]:
         """Acceleration (m/s^2) and steering angle (rad) that the actuators have in force."""
-        return float(self._memory[kernels.ACCELERATION]), float(self._memory[kernels.STEERING])
+        return float(self._record[kernels.ACCELERATION]), float(self._record[kernels.STEERING])
 
     @property
     def controller_busy(self) -> bool:
         """Whether the controller still computes an earlier action: the next will be dropped."""
-        now = float(self._memory[kernels.STEPS] * self.control_period)
+        now = float(self._record[kernels.STEPS] * self.control_period)
         return self._conditioned is not None and self._conditioned.busy_at(now)
 
     def set_computing_time(self, latency: float, occupied: float | None = None) -> None:
@@ -327,22 +327,22 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._use(task, plant)
         if self._conditioned is None:
             episodes.begin(
-                self._memory, self._constants, self._table, self._observation,
+                self._record, self._constants, self._table, self._observation,
                 self._key, self._episode, given,
             )  # fmt: skip
         else:
             self._draws[:] = self._key, self._episode
             conditions_episode.begin_under_conditions(
-                self._conditioned.memory, self._memory, self._conditioned.spec, self._constants,
+                self._conditioned.vehicle, self._record, self._conditioned.spec, self._constants,
                 self._table, self._observation, self._draws, given,
             )  # fmt: skip
         if plant is not None:
-            plant.begin(self._memory)
+            plant.begin(self._record)
         self._running = True
         self._begin_drawing()
         if self.render_mode == "human":
             self.render()
-        info = single_info(self._memory)
+        info = single_info(self._record)
         if self._conditioned is not None:
             info.update(self._conditioned.info())
         return self._observation.copy(), info
@@ -410,7 +410,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _show(self) -> None:
         if self._renderer is not None:
-            self._renderer.follow(self._memory)
+            self._renderer.follow(self._record)
         if self.render_mode == "human":
             self.render()
 
@@ -423,7 +423,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise gymnasium.error.ResetNeeded(
                 "the episode has not begun: call reset() before render()"
             )
-        return self._open_renderer(self.render_mode).draw(self._memory)
+        return self._open_renderer(self.render_mode).draw(self._record)
 
     def _begin_drawing(self) -> None:
         """Tell the renderer, if there is one, of a new episode."""
@@ -439,13 +439,13 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._renderer
 
     def draw(
-        self, task: Task, memory: NDArray[np.float64], notes: Mapping[str, str] | None = None
+        self, task: Task, record: NDArray[np.float64], notes: Mapping[str, str] | None = None
     ) -> NDArray[np.uint8]:
         """Draw an episode and `notes` that are not this environment's own: (600, 900, 3) uint8."""
         renderer = self._open_renderer("rgb_array")
         renderer.begin(task)
         renderer.notes = notes or {}
-        frame = renderer.draw(memory)
+        frame = renderer.draw(record)
         assert frame is not None
         return frame
 
@@ -468,7 +468,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def __getstate__(self) -> dict[str, Any]:
         # Copied on their own, the views would no longer look at the array.
-        views = {"_memory", "_state", "_constants", "_observation", "_command"}
+        views = {"_record", "_state", "_constants", "_observation", "_command"}
         compiled = {"_arguments", "_advance"}
         kept = {
             name: value for name, value in self.__dict__.items() if name not in views | compiled

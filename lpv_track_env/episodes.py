@@ -1,4 +1,4 @@
-"""How episodes begin: what is drawn for them (`draws`) and the memory it leads to.
+"""How episodes begin: what is drawn for them (`draws`) and the record it leads to.
 
 An environment holds one random 64-bit key and counts its episodes. An episode does not depend on
 how many environments there are, on which of them reset before, or on what else was drawn.
@@ -63,10 +63,10 @@ def error(given: Any, half: Any, key: Any, episode: Any, draw: int) -> Any:
 
 @compiled
 def begin(
-    memory: Array, constants: Array, table: Array, observation: Array,
+    record: Array, constants: Array, table: Array, observation: Array,
     key: Any, episode: Any, given: Array,
 ) -> None:  # fmt: skip
-    """Begin an episode: draw what is not given, set the state, write memory and observation.
+    """Begin an episode: draw what is not given, set the state, write record and observation.
 
     `given`, shape (4,), as `GIVEN` lists it: m, m, rad, m/s.
     """
@@ -80,11 +80,11 @@ def begin(
     length, closed = p[kernels.LENGTH], p[kernels.CLOSED] > 0.5
     heading = heading_at(table, length, closed, s)
     x, y = position_at(table, length, closed, s)
-    memory[:] = 0.0
-    memory[VX] = speed_at(table, length, closed, s) + speed_error
-    memory[PSI] = heading + heading_error
-    memory[X] = x - lateral_error * math.sin(heading)
-    memory[Y] = y + lateral_error * math.cos(heading)
-    memory[kernels.ACCELERATION] = p[ROLLING_DECELERATION]
-    memory[kernels.ARC_LENGTH] = s
-    kernels.start(memory, p, table, observation)
+    record[:] = 0.0
+    record[VX] = speed_at(table, length, closed, s) + speed_error
+    record[PSI] = heading + heading_error
+    record[X] = x - lateral_error * math.sin(heading)
+    record[Y] = y + lateral_error * math.cos(heading)
+    record[kernels.ACCELERATION] = p[ROLLING_DECELERATION]
+    record[kernels.ARC_LENGTH] = s
+    kernels.start(record, p, table, observation)

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lpv_track_env import observation as entry
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.integration import integrate
-from lpv_track_env.observation import PREVIEW_BOUNDS, SCALARS
+from lpv_track_env.observation import PREVIEW_BOUNDS, PREVIEW_START, SCALARS
 from lpv_track_env.reward import terms
 from trajectories.compilation import compiled, compiled_in_place, compiled_inline, compiled_internal
 from trajectories.interpolation import cell, saturate, speed_in
@@ -22,13 +23,13 @@ from trajectories.projection import SEARCH_WINDOW, follow
 
 Array = NDArray[Any]
 
-# Memory of an episode, (MEMORY_SIZE,) float64: the state, then
+# Record of an episode, (RECORD_SIZE,) float64: the state, then
 ACCELERATION, STEERING, START, STEPS, REFERENCE_SPEED, END = 6, 7, 8, 9, 10, 11
 # and, from ARC_LENGTH on, what a step is reported by:
 ARC_LENGTH, LATERAL_ERROR, HEADING_ERROR, SPEED_ERROR, CLIPPED, REWARD, TERMS = (
     12, 13, 14, 15, 16, 17, 18,
 )  # fmt: skip
-MEMORY_SIZE = 24
+RECORD_SIZE = 24
 
 # Constants of an environment, (CONSTANTS_SIZE,) float64: 7 vehicle parameters, then
 MAX_STEERING, STEERING_STEP, LOWEST_ACCELERATION, HIGHEST_ACCELERATION, ACCELERATION_STEP = (
@@ -41,8 +42,8 @@ START_RANGE, LATERAL_RANGE, HEADING_RANGE, SPEED_RANGE, WEIGHTS = 20, 21, 22, 23
 CONSTANTS_SIZE = 35
 
 # A single environment, float64: its command [a, delta], then
-MEMORY = 2
-CONSTANTS = MEMORY + MEMORY_SIZE
+RECORD = 2
+CONSTANTS = RECORD + RECORD_SIZE
 OBSERVATION = CONSTANTS + CONSTANTS_SIZE
 """From here on float32, two numbers to an entry."""
 
@@ -59,7 +60,6 @@ RANGE_ACCELERATION, RATE_ACCELERATION, RANGE_STEERING, RATE_STEERING = 1, 2, 4, 
 """Bits of what the actuators clipped."""
 
 MAX_HEADING_ERROR = 0.5 * math.pi
-PREVIEW_START = len(SCALARS)
 BOUNDS = tuple(bound for _, _, bound in SCALARS)
 CURVATURE_BOUND, SPEED_BOUND = (bound for _, _, bound in PREVIEW_BOUNDS)
 
@@ -108,20 +108,20 @@ def actuate(
 
 @compiled_inline
 def observe(
-    memory: Array, constants: Array, table: Array, observation: Array, index: int, u: Any
+    record: Array, constants: Array, table: Array, observation: Array, index: int, u: Any
 ) -> None:  # fmt: skip
     """Write the observation (see `observation`); the foot point is at u in [0, 1] of a cell."""
-    k = (observation.shape[0] - PREVIEW_START) // 2
-    observation[0] = saturate(memory[VX], BOUNDS[0])
-    observation[1] = saturate(memory[VY], BOUNDS[1])
-    observation[2] = saturate(memory[YAW_RATE], BOUNDS[2])
-    observation[3] = saturate(memory[ACCELERATION], BOUNDS[3])
-    observation[4] = saturate(memory[STEERING], BOUNDS[4])
-    observation[5] = saturate(memory[LATERAL_ERROR], BOUNDS[5])
-    observation[6] = saturate(memory[HEADING_ERROR], BOUNDS[6])
-    observation[7] = saturate(memory[REFERENCE_SPEED], BOUNDS[7])
+    o, k = observation, (observation.shape[0] - PREVIEW_START) // 2
+    o[entry.LONGITUDINAL_SPEED] = saturate(record[VX], BOUNDS[entry.LONGITUDINAL_SPEED])
+    o[entry.LATERAL_SPEED] = saturate(record[VY], BOUNDS[entry.LATERAL_SPEED])
+    o[entry.YAW_RATE] = saturate(record[YAW_RATE], BOUNDS[entry.YAW_RATE])
+    o[entry.ACCELERATION] = saturate(record[ACCELERATION], BOUNDS[entry.ACCELERATION])
+    o[entry.STEERING_ANGLE] = saturate(record[STEERING], BOUNDS[entry.STEERING_ANGLE])
+    o[entry.LATERAL_ERROR] = saturate(record[LATERAL_ERROR], BOUNDS[entry.LATERAL_ERROR])
+    o[entry.HEADING_ERROR] = saturate(record[HEADING_ERROR], BOUNDS[entry.HEADING_ERROR])
+    o[entry.REFERENCE_SPEED] = saturate(record[REFERENCE_SPEED], BOUNDS[entry.REFERENCE_SPEED])
     fill_preview(
-        table, constants[LENGTH], constants[CLOSED] > 0.5, memory[ARC_LENGTH], index, u,
+        table, constants[LENGTH], constants[CLOSED] > 0.5, record[ARC_LENGTH], index, u,
         constants[PREVIEW_PERIOD], observation, PREVIEW_START, k,
         CURVATURE_BOUND, SPEED_BOUND,
     )  # fmt: skip
@@ -129,79 +129,79 @@ def observe(
 
 @compiled_inline
 def locate(
-    memory: Array, constants: Array, table: Array, near: Any, ahead: Any, window: Any
+    record: Array, constants: Array, table: Array, near: Any, ahead: Any, window: Any
 ) -> tuple[int, Any]:
     """Project the vehicle on the path, about `ahead` m after `near`, and note its errors.
 
     Returns the foot point's cell and u in it.
     """
     s, lateral_error, heading, index, u, _ = follow(
-        table, constants[LENGTH], constants[CLOSED] > 0.5, memory[X], memory[Y],
+        table, constants[LENGTH], constants[CLOSED] > 0.5, record[X], record[Y],
         near, ahead, window, constants[TIGHTEST],
     )  # fmt: skip
     reference_speed = speed_in(table, index, u)
-    memory[ARC_LENGTH] = s
-    memory[LATERAL_ERROR] = lateral_error
-    memory[HEADING_ERROR] = wrap(memory[PSI] - heading)
-    memory[REFERENCE_SPEED] = reference_speed
-    memory[SPEED_ERROR] = memory[VX] - reference_speed
+    record[ARC_LENGTH] = s
+    record[LATERAL_ERROR] = lateral_error
+    record[HEADING_ERROR] = wrap(record[PSI] - heading)
+    record[REFERENCE_SPEED] = reference_speed
+    record[SPEED_ERROR] = record[VX] - reference_speed
     return index, u
 
 
 @compiled
 def look(
-    memory: Array, constants: Array, table: Array, observation: Array, ahead: Any, window: Any
+    record: Array, constants: Array, table: Array, observation: Array, ahead: Any, window: Any
 ) -> None:
-    """Find the memory's state on the path, about `ahead` m from its arc length, and observe it."""
-    index, u = locate(memory, constants, table, memory[ARC_LENGTH], ahead, window)
-    observe(memory, constants, table, observation, index, u)
+    """Find the record's state on the path, about `ahead` m from its arc length, and observe it."""
+    index, u = locate(record, constants, table, record[ARC_LENGTH], ahead, window)
+    observe(record, constants, table, observation, index, u)
 
 
 @compiled_inline
-def judge(memory: Array, constants: Array, finite: bool) -> int:
+def judge(record: Array, constants: Array, finite: bool) -> int:
     """How the episode stands: RUNNING or the code of its end."""
     if not finite:
         return NON_FINITE
-    if abs(memory[LATERAL_ERROR]) > constants[CORRIDOR]:
+    if abs(record[LATERAL_ERROR]) > constants[CORRIDOR]:
         return LEFT_CORRIDOR
-    if abs(memory[HEADING_ERROR]) > MAX_HEADING_ERROR:
+    if abs(record[HEADING_ERROR]) > MAX_HEADING_ERROR:
         return WRONG_HEADING
     goal = constants[LENGTH]
     if constants[CLOSED] > 0.5:
-        goal += memory[START]
-    if memory[ARC_LENGTH] >= goal - 1e-9:
+        goal += record[START]
+    if record[ARC_LENGTH] >= goal - 1e-9:
         return FINISHED
-    if memory[STEPS] >= constants[MAX_STEPS]:
+    if record[STEPS] >= constants[MAX_STEPS]:
         return TIME_LIMIT
     return RUNNING
 
 
 @compiled_inline
 def finish(
-    memory: Array, constants: Array, table: Array, observation: Array,
+    record: Array, constants: Array, table: Array, observation: Array,
     vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, a: Any, delta: Any, bits: int,
 ) -> int:  # fmt: skip
     """End a control period with a new state and actuators: errors, end, reward, observation.
 
-    A non-finite new state ends the episode: the memory keeps the last finite state.
+    A non-finite new state ends the episode: the record keeps the last finite state.
     """
     p = constants
-    last_a, last_delta, before = memory[ACCELERATION], memory[STEERING], memory[ARC_LENGTH]
+    last_a, last_delta, before = record[ACCELERATION], record[STEERING], record[ARC_LENGTH]
     finite = math.isfinite(vx + vy + psi + r + x + y)
-    memory[STEPS] += 1.0
-    memory[CLIPPED] = bits
+    record[STEPS] += 1.0
+    record[CLIPPED] = bits
     if finite:
-        memory[VX], memory[VY], memory[PSI] = vx, vy, psi
-        memory[YAW_RATE], memory[X], memory[Y] = r, x, y
-        memory[ACCELERATION], memory[STEERING] = a, delta
+        record[VX], record[VY], record[PSI] = vx, vy, psi
+        record[YAW_RATE], record[X], record[Y] = r, x, y
+        record[ACCELERATION], record[STEERING] = a, delta
         ahead = vx * p[PERIOD]
         reach = min(max(SEARCH_WINDOW, 1.5 * abs(ahead)), p[LENGTH])
-        index, u = locate(memory, constants, table, before, ahead, reach)
+        index, u = locate(record, constants, table, before, ahead, reach)
     else:
         n = table.shape[0]
         index, offset = cell(before, p[LENGTH], p[CLOSED] > 0.5, n)
         u = offset * (n - 1) / p[LENGTH]
-    end = judge(memory, constants, finite)
+    end = judge(record, constants, finite)
     failed = end in (LEFT_CORRIDOR, WRONG_HEADING, NON_FINITE)
     # A tuple, for a slice would be an array with a reference count to keep.
     w = WEIGHTS
@@ -210,37 +210,37 @@ def finish(
         p[w + 9], p[w + 10],
     )  # fmt: skip
     parts = terms(
-        weights, p[PERIOD], memory[ARC_LENGTH] - before,
-        memory[LATERAL_ERROR], memory[HEADING_ERROR], memory[SPEED_ERROR],
-        memory[REFERENCE_SPEED], (a - last_a) / p[PERIOD], (delta - last_delta) / p[PERIOD], failed,
+        weights, p[PERIOD], record[ARC_LENGTH] - before,
+        record[LATERAL_ERROR], record[HEADING_ERROR], record[SPEED_ERROR],
+        record[REFERENCE_SPEED], (a - last_a) / p[PERIOD], (delta - last_delta) / p[PERIOD], failed,
     )  # fmt: skip
     total = 0.0
     for k in range(len(parts)):
-        memory[TERMS + k] = parts[k]
+        record[TERMS + k] = parts[k]
         total += parts[k]
-    memory[REWARD] = total
-    memory[END] = end
-    observe(memory, constants, table, observation, index, u)
+    record[REWARD] = total
+    record[END] = end
+    observe(record, constants, table, observation, index, u)
     return end
 
 
 @compiled_in_place
 def drive(
-    memory: Array, a: Any, delta: Any, constants: Array, table: Array, observation: Array
+    record: Array, a: Any, delta: Any, constants: Array, table: Array, observation: Array
 ) -> int:
     """One control period of an episode under a command, in place; returns the code of its end."""
     p = constants
     a, delta, bits = actuate(
-        a, delta, memory[ACCELERATION], memory[STEERING],
+        a, delta, record[ACCELERATION], record[STEERING],
         p[MAX_STEERING], p[STEERING_STEP], p[LOWEST_ACCELERATION], p[HIGHEST_ACCELERATION],
         p[ACCELERATION_STEP],
     )  # fmt: skip
     substeps = int(p[SUBSTEPS])
     vx, vy, psi, r, x, y = integrate(
-        memory[VX], memory[VY], memory[PSI], memory[YAW_RATE], memory[X], memory[Y], a, delta,
+        record[VX], record[VY], record[PSI], record[YAW_RATE], record[X], record[Y], a, delta,
         p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[PERIOD] / substeps, substeps,
     )  # fmt: skip
-    return finish(memory, constants, table, observation, vx, vy, psi, r, x, y, a, delta, bits)
+    return finish(record, constants, table, observation, vx, vy, psi, r, x, y, a, delta, bits)
 
 
 @compiled
@@ -249,12 +249,12 @@ def advance(
 ) -> tuple[int, Any, Any, Any, Any, int, Any, Any, Any, Any, Any, Any, Any]:
     """One control period of a single environment, packed into `episode`, in place.
 
-    Returns the code of its end and the memory from ARC_LENGTH on; NOT_FINITE, and nothing is
+    Returns the code of its end and the record from ARC_LENGTH on; NOT_FINITE, and nothing is
     changed, for a command that is not finite. A step of Python pays for each array that it hands
     over, and more for each number that it looks up: hence all in one, and all at once.
     """
     a, delta = episode[0], episode[1]
-    m = episode[MEMORY:CONSTANTS]
+    m = episode[RECORD:CONSTANTS]
     if math.isfinite(a) and math.isfinite(delta):
         end = drive(
             m, a, delta, episode[CONSTANTS:OBSERVATION], table,
@@ -272,7 +272,7 @@ def advance(
 @compiled
 def command(episode: Array) -> tuple[Any, Any, int]:
     """Actuators' values for the command in `episode`, and the bits of what they clipped."""
-    m, p = episode[MEMORY:CONSTANTS], episode[CONSTANTS:OBSERVATION]
+    m, p = episode[RECORD:CONSTANTS], episode[CONSTANTS:OBSERVATION]
     a, delta, bits = actuate(
         episode[0], episode[1], m[ACCELERATION], m[STEERING],
         p[MAX_STEERING], p[STEERING_STEP], p[LOWEST_ACCELERATION], p[HIGHEST_ACCELERATION],
@@ -288,18 +288,18 @@ def conclude(
 ) -> int:  # fmt: skip
     """End a control period whose new state another plant has come to; returns the end's code."""
     end: int = finish(
-        episode[MEMORY:CONSTANTS], episode[CONSTANTS:OBSERVATION], table,
+        episode[RECORD:CONSTANTS], episode[CONSTANTS:OBSERVATION], table,
         episode[OBSERVATION:].view(np.float32), vx, vy, psi, r, x, y, a, delta, bits,
     )  # fmt: skip
     return end
 
 
 @compiled
-def start(memory: Array, constants: Array, table: Array, observation: Array) -> None:
-    """Begin an episode from the state and actuators that `memory` holds, near its ARC_LENGTH."""
-    near = memory[ARC_LENGTH]
-    memory[START:] = 0.0
+def start(record: Array, constants: Array, table: Array, observation: Array) -> None:
+    """Begin an episode from the state and actuators that `record` holds, near its ARC_LENGTH."""
+    near = record[ARC_LENGTH]
+    record[START:] = 0.0
     window = min(SEARCH_WINDOW, constants[LENGTH])
-    index, u = locate(memory, constants, table, near, 0.0, window)
-    memory[START] = memory[ARC_LENGTH]
-    observe(memory, constants, table, observation, index, u)
+    index, u = locate(record, constants, table, near, 0.0, window)
+    record[START] = record[ARC_LENGTH]
+    observe(record, constants, table, observation, index, u)

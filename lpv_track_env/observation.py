@@ -43,6 +43,12 @@ SCALARS = (
 )
 """Name, unit and bound of each scalar entry; values beyond a bound saturate at it."""
 
+# Index of each scalar entry, and of the first entry of the preview: curvatures, then speeds.
+(
+    LONGITUDINAL_SPEED, LATERAL_SPEED, YAW_RATE, ACCELERATION, STEERING_ANGLE, LATERAL_ERROR,
+    HEADING_ERROR, REFERENCE_SPEED, PREVIEW_START,
+) = range(9)  # fmt: skip
+
 PREVIEW_BOUNDS = (("preview_curvature", "1/m", 20.0), ("preview_speed", "m/s", 100.0))
 
 MIRRORED = (
@@ -98,13 +104,13 @@ class ObservationLayout:
     @property
     def size(self) -> int:
         """Length of the vector."""
-        return len(SCALARS) + 2 * self.preview_steps
+        return PREVIEW_START + 2 * self.preview_steps
 
     @property
     def slices(self) -> dict[str, slice]:
         """Where each named entry stands in the vector."""
         scalars = {name: slice(k, k + 1) for k, (name, _, _) in enumerate(SCALARS)}
-        first, k = len(SCALARS), self.preview_steps
+        first, k = PREVIEW_START, self.preview_steps
         return {
             **scalars,
             "preview_curvature": slice(first, first + k),
@@ -156,7 +162,7 @@ class ObservationLayout:
                 f"observation has shape {values.shape}, this layout has {self.size} entries "
                 f"({self.preview_steps} preview steps): make the agent for this environment"
             )
-        first, k = len(SCALARS), self.preview_steps
+        first, k = PREVIEW_START, self.preview_steps
         scalars = [values[..., index] for index in range(first)]
         previews = [values[..., first : first + k], values[..., first + k :]]
         return TrackingObservation._make(scalars + previews)

@@ -58,49 +58,49 @@ class Sensors:
         spec[: 2 * conditions_layout.COUNT] = conditions.ranges().ravel()
         spec[conditions_layout.GNSS_PERIOD] = conditions.gnss_period
         self._key = random_key(np.random.default_rng(seed))
-        self._memory, self._state = np.zeros(conditions_layout.TAIL), np.zeros(STATE_SIZE)
+        self._vehicle, self._state = np.zeros(conditions_layout.TAIL), np.zeros(STATE_SIZE)
         self._calls = 0
         self._inertial_time = self._fix_time = 0.0
-        _draw(self._memory, spec, self._key)
+        _draw(self._vehicle, spec, self._key)
 
     @property
     def drawn(self) -> dict[str, float]:
         """What the conditions' ranges were drawn to, by field."""
-        return dict(zip(DRAWN, self._memory[: len(DRAWN)].tolist(), strict=True))
+        return dict(zip(DRAWN, self._vehicle[: len(DRAWN)].tolist(), strict=True))
 
     def inertial(self, time: float, heading: float, yaw_rate: float) -> tuple[float, float]:
         """Heading (rad) and yaw rate (rad/s) as an IMU reads them at `time` (s)."""
         self._state[PSI], self._state[YAW_RATE] = heading, yaw_rate
         self._read(max(time - self._inertial_time, 0.0))
         self._inertial_time = time
-        return float(self._memory[conditions_layout.READ_HEADING]), float(
-            self._memory[conditions_layout.READ_YAW_RATE]
+        return float(self._vehicle[conditions_layout.READ_HEADING]), float(
+            self._vehicle[conditions_layout.READ_YAW_RATE]
         )
 
     def wheel_speed(self, speed: float) -> float:
         """Speed (m/s) as the wheels tell it."""
         self._state[VX] = speed
         self._read(0.0)
-        return float(self._memory[conditions_layout.READ_SPEED])
+        return float(self._vehicle[conditions_layout.READ_SPEED])
 
     def first_fix(self, x: float, y: float) -> tuple[float, float]:
         """A fix (m) before the drive begins: there is one, and it is no outlier."""
         _, measured_x, measured_y = _fix(
-            self._memory, float(x), float(y), 0.0, -1.0, self._key, self._next()
+            self._vehicle, float(x), float(y), 0.0, -1.0, self._key, self._next()
         )
         return measured_x, measured_y
 
     def fix(self, time: float, x: float, y: float) -> tuple[float, float] | None:
         """The fix (m) of a position at `time` (s, from 0 on), or None in an outage."""
         there, measured_x, measured_y = _fix(
-            self._memory, float(x), float(y), max(time - self._fix_time, 0.0), float(time),
+            self._vehicle, float(x), float(y), max(time - self._fix_time, 0.0), float(time),
             self._key, self._next(),
         )  # fmt: skip
         self._fix_time = time
         return (measured_x, measured_y) if there else None
 
     def _read(self, period: float) -> None:
-        _read(self._memory, self._state, self._key, self._next(), float(period))
+        _read(self._vehicle, self._state, self._key, self._next(), float(period))
 
     def _next(self) -> int:
         self._calls += 1

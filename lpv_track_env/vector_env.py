@@ -45,10 +45,10 @@ MODES = {
 
 
 class KernelArrays(NamedTuple):
-    """What the kernels know of n environments: see `kernels` for memories and constants."""
+    """What the kernels know of n environments: see `kernels` for records and constants."""
 
-    memories: Array
-    """(n, MEMORY_SIZE)."""
+    records: Array
+    """(n, RECORD_SIZE)."""
     observations: Array
     """(n, size) float32."""
     ends: Array
@@ -183,8 +183,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         n, size = self.num_envs, self._single.layout.size
-        self._memories = np.zeros((n, kernels.MEMORY_SIZE))
-        self._final_memories = np.zeros((n, kernels.MEMORY_SIZE))
+        self._records = np.zeros((n, kernels.RECORD_SIZE))
+        self._final_records = np.zeros((n, kernels.RECORD_SIZE))
         self._observations = np.zeros((n, size), dtype=np.float32)
         self._final_observations = np.zeros((n, size), dtype=np.float32)
         self._scratch = np.zeros((shares(self._threads), vector_kernels.SCRATCH_SIZE))
@@ -234,7 +234,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         From there on the same actions lead to the same, until the next reset with another seed.
         """
         for array in (
-            self._memories, self._observations, self._ends, self._cases, self._keys, self._episodes,
+            self._records, self._observations, self._ends, self._cases, self._keys, self._episodes,
         ):  # fmt: skip
             array[target] = array[source]
         if self._conditioned is not None:
@@ -249,7 +249,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
     def arrays(self) -> KernelArrays:
         """Arrays of the current episodes, not copies, for compiled code that steps them itself."""
         return KernelArrays(
-            self._memories, self._observations, self._ends, self._cases, self._constants,
+            self._records, self._observations, self._ends, self._cases, self._constants,
             self._tables, self._rows,
         )  # fmt: skip
 
@@ -264,21 +264,21 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         return self._conditioned.arrays(self._keys, self._episodes)
 
     @property
-    def memories(self) -> Array:
-        """Memories of the current episodes, (n, `kernels.MEMORY_SIZE`), to read."""
-        return self._memories
+    def records(self) -> Array:
+        """Records of the current episodes, (n, `kernels.RECORD_SIZE`), to read."""
+        return self._records
 
     def info_of(self, index: int) -> Infos:
         """Info of environment `index`, as the single environment gives it, without its end."""
-        info = single_info(self._memories[index])
+        info = single_info(self._records[index])
         if self._conditioned is not None:
             info.update(self._conditioned.single_info(index))
         return info
 
     def final_of(self, index: int) -> tuple[Infos, Array]:
         """Last info and observation of environment `index`, which just ended in SAME_STEP."""
-        memory = self._final_memories[index]
-        info = {**single_info(memory), "end": kernels.END_NAMES[int(memory[kernels.END])]}
+        record = self._final_records[index]
+        info = {**single_info(record), "end": kernels.END_NAMES[int(record[kernels.END])]}
         if self._conditioned is not None:
             info.update(self._conditioned.final_info(index))
         return info, self._final_observations[index].copy()
@@ -286,7 +286,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
     @property
     def state(self) -> Array:
         """True states [vx, vy, psi, r, X, Y], (n, 6), a copy."""
-        return self._memories[:, :6].copy()
+        return self._records[:, :6].copy()
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Infos | None = None
@@ -320,18 +320,18 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._pack_beside(tasks if tasks is not self.tasks else [], mask)
         if self._conditioned is None:
             vector_kernels.begin_all(
-                mask, self._memories, self._cases, drawn, self._constants, self._tables,
+                mask, self._records, self._cases, drawn, self._constants, self._tables,
                 self._rows, self._keys, self._episodes, given, self._observations, self._ends,
             )  # fmt: skip
         else:
             self._conditioned.begin(
                 mask, self._keys, self._episodes,
                 (
-                    self._memories, self._cases, drawn, self._constants, self._tables, self._rows,
+                    self._records, self._cases, drawn, self._constants, self._tables, self._rows,
                     given, self._observations, self._ends,
                 ),
             )  # fmt: skip
-        infos = episode_infos(self._memories, mask)
+        infos = episode_infos(self._records, mask)
         if self._conditioned is not None:
             infos.update(self._conditioned.infos(mask))
         return self._observations.copy(), infos
@@ -360,12 +360,12 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
         """Drive one control period; see the class for actions, autoreset, infos and errors."""
         observations, rewards, terminated, truncated = self.advance(actions)
-        infos = episode_infos(self._memories)
+        infos = episode_infos(self._records)
         ended = terminated | truncated
         if self._conditioned is not None:
             infos.update(self._conditioned.infos(np.ones(self.num_envs, dtype=np.bool_)))
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            infos.update(final_infos(self._final_memories, self._final_observations, ended))
+            infos.update(final_infos(self._final_records, self._final_observations, ended))
             if self._conditioned is not None:
                 infos["final_info"].update(self._conditioned.final_infos(ended))
         return observations, rewards, terminated, truncated, infos
@@ -380,16 +380,16 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             self._conditioned.advance(
                 self._mode, self._keys, self._episodes,
                 (
-                    self._memories, commands, self._cases, self._drawn, self._constants,
+                    self._records, commands, self._cases, self._drawn, self._constants,
                     self._tables, self._rows, self._nothing_given, self._observations, self._ends,
-                    rewards, self._final_memories, self._final_observations,
+                    rewards, self._final_records, self._final_observations,
                 ),
             )  # fmt: skip
             return self._outcome(rewards)
         arguments = (
-            self._mode, self._memories, commands, self._cases, self._drawn, self._constants,
+            self._mode, self._records, commands, self._cases, self._drawn, self._constants,
             self._tables, self._rows, self._keys, self._episodes, self._nothing_given,
-            self._observations, self._ends, rewards, self._final_memories, self._final_observations,
+            self._observations, self._ends, rewards, self._final_records, self._final_observations,
         )  # fmt: skip
         if self._threads == 1:
             vector_kernels.advance(0, n, *arguments, self._scratch[0])
@@ -440,7 +440,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._check_begun()
         return tuple(
             self._single.draw(
-                self.task_of(i), self._memories[i], None if notes is None else notes[i]
+                self.task_of(i), self._records[i], None if notes is None else notes[i]
             )
             for i in range(self.num_envs)
         )

@@ -1,4 +1,4 @@
-"""Infos of the vector environment, as Gymnasium's `SyncVectorEnv` gathers them, from memories."""
+"""Infos of the vector environment, as Gymnasium's `SyncVectorEnv` gathers them, from records."""
 
 from typing import Any
 
@@ -14,23 +14,23 @@ Infos = dict[str, Any]
 NAMES = np.array(kernels.END_NAMES, dtype=object)
 
 
-def episode_infos(memories: Array, mask: Array | None = None) -> Infos:
+def episode_infos(records: Array, mask: Array | None = None) -> Infos:
     """Infos of the episodes that `mask` (n,) marks, of all without; zeros for the others.
 
     Parameters
     ----------
-    memories
-        (n, MEMORY_SIZE), as `kernels` lays them out.
+    records
+        (n, RECORD_SIZE), as `kernels` lays them out.
     mask
         (n,) bool.
     """
     # One copy in which every entry is a row of its own.
     if mask is None:
-        mask = np.ones(len(memories), dtype=np.bool_)
-        values = memories.T.copy()
+        mask = np.ones(len(records), dtype=np.bool_)
+        values = records.T.copy()
     else:
-        values = np.zeros(memories.T.shape)
-        values[:, mask] = memories[mask].T
+        values = np.zeros(records.T.shape)
+        values[:, mask] = records[mask].T
     terms: Infos = {}
     for k, name in enumerate(TERMS):
         terms[name], terms[f"_{name}"] = values[kernels.TERMS + k], mask
@@ -52,7 +52,7 @@ def episode_infos(memories: Array, mask: Array | None = None) -> Infos:
     return infos
 
 
-def final_infos(memories: Array, observations: Array, ended: Array) -> Infos:
+def final_infos(records: Array, observations: Array, ended: Array) -> Infos:
     """`final_obs` and `final_info` of the episodes that have `ended` (n,), with their masks."""
     final = np.full(len(ended), None, dtype=object)
     for i in np.flatnonzero(ended).tolist():
@@ -60,20 +60,20 @@ def final_infos(memories: Array, observations: Array, ended: Array) -> Infos:
     return {
         "final_obs": final,
         "_final_obs": ended,
-        "final_info": episode_infos(memories, ended),
+        "final_info": episode_infos(records, ended),
         "_final_info": ended,
     }
 
 
-def single_info(memory: Array) -> Infos:
-    """Info of one episode without its end, as `PathTrackingEnv` gives it, from its memory."""
-    values = memory.tolist()
+def single_info(record: Array) -> Infos:
+    """Info of one episode without its end, as `PathTrackingEnv` gives it, from its record."""
+    values = record.tolist()
     return {
         "lateral_error": values[kernels.LATERAL_ERROR],
         "heading_error": values[kernels.HEADING_ERROR],
         "speed_error": values[kernels.SPEED_ERROR],
         "arc_length": values[kernels.ARC_LENGTH],
-        "state": memory[:6].copy(),
+        "state": record[:6].copy(),
         "reward_terms": dict(zip(TERMS, values[kernels.TERMS :], strict=True)),
         "clipped": int(values[kernels.CLIPPED]),
     }

@@ -62,16 +62,16 @@ def integrate_lanes(b: Array, substeps: int) -> None:
 
 
 @compiled_inline
-def load_lane(b: Array, j: int, memory: Array, action: Array, p: Array) -> None:
+def load_lane(b: Array, j: int, record: Array, action: Array, p: Array) -> None:
     """Copy a vehicle into lane j: state, what its actuators give, parameters, substeps."""
     a, delta, bits = k.actuate(
-        action[0], action[1], memory[k.ACCELERATION], memory[k.STEERING],
+        action[0], action[1], record[k.ACCELERATION], record[k.STEERING],
         p[k.MAX_STEERING], p[k.STEERING_STEP], p[k.LOWEST_ACCELERATION],
         p[k.HIGHEST_ACCELERATION], p[k.ACCELERATION_STEP],
     )  # fmt: skip
     for row in range(6):
-        b[row * LANES + j] = memory[row]
-    b[COS + j], b[SIN + j] = math.cos(memory[PSI]), math.sin(memory[PSI])
+        b[row * LANES + j] = record[row]
+    b[COS + j], b[SIN + j] = math.cos(record[PSI]), math.sin(record[PSI])
     b[ACCELERATION + j], b[STEERING + j] = a, delta
     b[COS_STEERING + j], b[SIN_STEERING + j] = math.cos(delta), math.sin(delta)
     h = p[k.PERIOD] / p[k.SUBSTEPS]
@@ -83,11 +83,11 @@ def load_lane(b: Array, j: int, memory: Array, action: Array, p: Array) -> None:
 
 
 @compiled_internal
-def integrate_one(b: Array, j: int, memory: Array, p: Array) -> None:
+def integrate_one(b: Array, j: int, record: Array, p: Array) -> None:
     """Integrate lane j alone: for blocks whose vehicles need different numbers of substeps."""
     substeps = int(p[k.SUBSTEPS])
     vx, vy, psi, r, x, y = integrate(
-        memory[VX], memory[VY], memory[PSI], memory[YAW_RATE], memory[X], memory[Y],
+        record[VX], record[VY], record[PSI], record[YAW_RATE], record[X], record[Y],
         b[ACCELERATION + j], b[STEERING + j],
         p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[k.PERIOD] / substeps, substeps,
     )  # fmt: skip
@@ -127,7 +127,7 @@ def draw_case(drawn: Any, key: Any, episode: Any) -> Any:
 
 @compiled_internal
 def begin_next(
-    i: int, memory: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
+    i: int, record: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
     rows: Array, observation: Array, keys: Array, episodes: Array, given: Array,
 ) -> None:  # fmt: skip
     """Begin the next episode of environment i, on a path and with a vehicle that are drawn."""
@@ -135,12 +135,12 @@ def begin_next(
     case = draw_case(drawn, keys[i], episodes[i])
     cases[i] = case
     table = tables[rows[case, 0] : rows[case, 1]]
-    begin(memory, constants[case], table, observation, keys[i], episodes[i], given)
+    begin(record, constants[case], table, observation, keys[i], episodes[i], given)
 
 
 @compiled_internal
 def copy(source: Array, target: Array) -> None:
-    """Copy a vector; an assignment would want memory for the case that the two overlap."""
+    """Copy a vector; an assignment would want record for the case that the two overlap."""
     for j in range(source.shape[0]):
         target[j] = source[j]
 
@@ -148,16 +148,16 @@ def copy(source: Array, target: Array) -> None:
 @compiled
 def advance(
     first: int, last: int, mode: int,
-    memories: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
+    records: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
     rows: Array, keys: Array, episodes: Array, given: Array,
-    observations: Array, ends: Array, rewards: Array, final_memories: Array,
+    observations: Array, ends: Array, rewards: Array, final_records: Array,
     final_observations: Array, b: Array,
 ) -> None:  # fmt: skip
     """One control period of the environments `first` to `last` - 1, with autoreset.
 
     `ends` (n,) holds each environment's end code of the last step and is given the new one. In
     NEXT_STEP an environment that had ended begins anew instead, with reward 0; in SAME_STEP one
-    that ends begins anew at once, its last memory and observation kept in the `final_` arrays. `b`
+    that ends begins anew at once, its last record and observation kept in the `final_` arrays. `b`
     is scratch, (SCRATCH_SIZE,).
     """
     for low in range(first, last, LANES):
@@ -166,36 +166,36 @@ def advance(
         for j in range(LANES):
             # Lanes beyond the last environment repeat the first: no lane holds rubbish.
             i = low + j if j < lanes else low
-            load_lane(b, j, memories[i], actions[i], constants[cases[i]])
+            load_lane(b, j, records[i], actions[i], constants[cases[i]])
             uniform = uniform and b[SUBSTEPS + j] == b[SUBSTEPS]
         if uniform:
             integrate_lanes(b, int(b[SUBSTEPS]))
         else:
             for j in range(lanes):
-                integrate_one(b, j, memories[low + j], constants[cases[low + j]])
+                integrate_one(b, j, records[low + j], constants[cases[low + j]])
         for j in range(lanes):
             i = low + j
-            memory, observation = memories[i], observations[i]
+            record, observation = records[i], observations[i]
             begins = mode == NEXT_STEP and ends[i] != k.RUNNING
             if begins:
                 ends[i], rewards[i] = k.RUNNING, 0.0
             else:
                 case = cases[i]
                 ends[i] = k.finish(
-                    memory, constants[case], tables[rows[case, 0] : rows[case, 1]], observation,
+                    record, constants[case], tables[rows[case, 0] : rows[case, 1]], observation,
                     b[VX * LANES + j], b[VY * LANES + j], b[PSI * LANES + j],
                     b[YAW_RATE * LANES + j], b[X * LANES + j], b[Y * LANES + j],
                     b[ACCELERATION + j], b[STEERING + j], int(b[CLIPPED + j]),
                 )  # fmt: skip
-                rewards[i] = memory[k.REWARD]
+                rewards[i] = record[k.REWARD]
                 if mode == SAME_STEP and ends[i] != k.RUNNING:
                     begins = True
-                    copy(memory, final_memories[i])
+                    copy(record, final_records[i])
                     copy(observation, final_observations[i])
             # One call for both modes: every call is compiled in.
             if begins:
                 begin_next(
-                    i, memory, cases, drawn, constants, tables, rows, observation,
+                    i, record, cases, drawn, constants, tables, rows, observation,
                     keys, episodes, given,
                 )  # fmt: skip
 
@@ -203,9 +203,9 @@ def advance(
 @compiled_parallel
 def advance_in_threads(
     chunks: int, n: int, mode: int,
-    memories: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
+    records: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
     rows: Array, keys: Array, episodes: Array, given: Array,
-    observations: Array, ends: Array, rewards: Array, final_memories: Array,
+    observations: Array, ends: Array, rewards: Array, final_records: Array,
     final_observations: Array, scratch: Array,
 ) -> None:  # fmt: skip
     """`advance` on all n environments, in chunks of whole blocks that threads share.
@@ -217,8 +217,8 @@ def advance_in_threads(
         first = chunk * blocks // chunks * LANES
         last = min((chunk + 1) * blocks // chunks * LANES, n)
         advance(
-            first, last, mode, memories, actions, cases, drawn, constants, tables, rows,
-            keys, episodes, given, observations, ends, rewards, final_memories,
+            first, last, mode, records, actions, cases, drawn, constants, tables, rows,
+            keys, episodes, given, observations, ends, rewards, final_records,
             final_observations, scratch[chunk],
         )  # fmt: skip
 
@@ -226,7 +226,7 @@ def advance_in_threads(
 @compiled
 def begin_all(
     mask: Array,
-    memories: Array, cases: Array, drawn: Any, constants: Array, tables: Array, rows: Array,
+    records: Array, cases: Array, drawn: Any, constants: Array, tables: Array, rows: Array,
     keys: Array, episodes: Array, given: Array, observations: Array, ends: Array,
 ) -> None:  # fmt: skip
     """Begin the next episode of every environment that `mask` (n,) marks."""
@@ -234,6 +234,6 @@ def begin_all(
         if mask[i]:
             ends[i] = k.RUNNING
             begin_next(
-                i, memories[i], cases, drawn, constants, tables, rows, observations[i],
+                i, records[i], cases, drawn, constants, tables, rows, observations[i],
                 keys, episodes, given,
             )  # fmt: skip

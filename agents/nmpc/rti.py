@@ -59,7 +59,7 @@ from agents.nmpc.qp import (
     solve_program,
 )
 from agents.reference import NODE, fill_nodes
-from lpv_track_env.kernels import PREVIEW_START
+from lpv_track_env.observation import PREVIEW_START
 from trajectories.compilation import (
     compiled,
     compiled_in_place,

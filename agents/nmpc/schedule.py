@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
-from lpv_track_env.kernels import PREVIEW_START
+from lpv_track_env.observation import PREVIEW_START
 from trajectories import CurvatureBands
 from trajectories.compilation import compiled, compiled_internal
 

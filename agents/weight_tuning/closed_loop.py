@@ -183,7 +183,7 @@ class ClosedLoop:
             that it may be given other weights; `memory.nmpc.bands` and
             `memory.watched` are those of the next period then.
         trace
-            Filled if given, (n, periods, `kernels.MEMORY_SIZE`): each environment's memory after
+            Filled if given, (n, periods, `kernels.RECORD_SIZE`): each environment's memory after
             each period that it drove.
 
         Raises
@@ -199,15 +199,15 @@ class ClosedLoop:
             raise gymnasium.error.ResetNeeded("the episodes have not begun: call reset() first")
         sets, rules = self._checked_weights(weights)
         if trace is None:
-            trace = np.empty((n, 0, k.MEMORY_SIZE))
+            trace = np.empty((n, 0, k.RECORD_SIZE))
         elif (
-            trace.shape != (n, periods, k.MEMORY_SIZE)
+            trace.shape != (n, periods, k.RECORD_SIZE)
             or trace.dtype != np.float64
             or not (trace.flags.c_contiguous and trace.flags.writeable)
         ):
             raise ValueError(
                 f"trace must be a writable C-ordered float64 array "
-                f"{(n, periods, k.MEMORY_SIZE)}, not {trace.dtype} {trace.shape}"
+                f"{(n, periods, k.RECORD_SIZE)}, not {trace.dtype} {trace.shape}"
             )
         since, progress, asked = (
             np.full(n, NO_BAND),

@@ -33,7 +33,7 @@ from agents.weight_tuning.watching import (
     SLOW,
     STATISTICS,
 )
-from lpv_track_env.kernels import PREVIEW_START
+from lpv_track_env.observation import PREVIEW_START
 from trajectories.compilation import compiled, compiled_internal
 
 Array = NDArray[Any]

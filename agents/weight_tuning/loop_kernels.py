@@ -33,21 +33,21 @@ solve, the vehicle is not to go on in this call."""
 
 
 @compiled_internal
-def count(memory: Array, before_a: Any, before_delta: Any, period: Any, sums: Array) -> None:
+def count(record: Array, before_a: Any, before_delta: Any, period: Any, sums: Array) -> None:
     """Add a period that was driven to its vehicle's tally, (TALLY,)."""
-    change_a = memory[k.ACCELERATION] - before_a
-    change_delta = memory[k.STEERING] - before_delta
+    change_a = record[k.ACCELERATION] - before_a
+    change_delta = record[k.STEERING] - before_delta
     sums[STEPS] += 1.0
-    sums[REWARD] += memory[k.REWARD]
-    sums[LATERAL] += memory[k.LATERAL_ERROR] * memory[k.LATERAL_ERROR]
-    sums[HEADING] += memory[k.HEADING_ERROR] * memory[k.HEADING_ERROR]
-    sums[SPEED] += memory[k.SPEED_ERROR] * memory[k.SPEED_ERROR]
+    sums[REWARD] += record[k.REWARD]
+    sums[LATERAL] += record[k.LATERAL_ERROR] * record[k.LATERAL_ERROR]
+    sums[HEADING] += record[k.HEADING_ERROR] * record[k.HEADING_ERROR]
+    sums[SPEED] += record[k.SPEED_ERROR] * record[k.SPEED_ERROR]
     sums[STEERING_RATE] += change_delta * change_delta / (period * period)
     sums[JERK] += change_a * change_a / (period * period)
-    sums[MAX_LATERAL] = max(sums[MAX_LATERAL], abs(memory[k.LATERAL_ERROR]))
-    sums[MAX_HEADING] = max(sums[MAX_HEADING], abs(memory[k.HEADING_ERROR]))
+    sums[MAX_LATERAL] = max(sums[MAX_LATERAL], abs(record[k.LATERAL_ERROR]))
+    sums[MAX_HEADING] = max(sums[MAX_HEADING], abs(record[k.HEADING_ERROR]))
     sums[STEERING_VARIATION] += abs(change_delta)
-    if memory[k.CLIPPED] > 0.0:
+    if record[k.CLIPPED] > 0.0:
         sums[CLIPPED] += 1.0
 
 
@@ -174,7 +174,7 @@ def decide(
 
 @compiled
 def drive_rows(
-    first: int, last: int, periods: int, memories: Array, observations: Array, ends: Array,
+    first: int, last: int, periods: int, records: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
     feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
     watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
@@ -188,13 +188,13 @@ def drive_rows(
     One whose solve fails stays where it is, `asked` (n,) HELD; set to GIVEN it goes on with its row
     of `actions` in place of that solve. With `until_band` one waits, PAUSED, where the preview's
     band changes, and in the end `bands` and `watched` are those of the next period. `trace`
-    (n, periods or 0, MEMORY_SIZE) gets every memory. `nodes`, `scratch`, `stages` and `lanes` are
+    (n, periods or 0, RECORD_SIZE) gets every record. `nodes`, `scratch`, `stages` and `lanes` are
     working space.
     """
     for row in range(first, last):
         if asked[row] == HELD or asked[row] == PAUSED:
             continue
-        memory, case = memories[row], cases[row]
+        record, case = records[row], cases[row]
         table = tables[rows[case, 0] : rows[case, 1]]
         period = env_constants[case, k.PERIOD]
         while progress[row] < periods and ends[row] == k.RUNNING:
@@ -206,15 +206,15 @@ def drive_rows(
             )  # fmt: skip
             if asked[row] != ASKED:
                 break
-            before_a, before_delta = memory[k.ACCELERATION], memory[k.STEERING]
+            before_a, before_delta = record[k.ACCELERATION], record[k.STEERING]
             ends[row] = k.drive(
-                memory, actions[row, 0], actions[row, 1], env_constants[case], table,
+                record, actions[row, 0], actions[row, 1], env_constants[case], table,
                 observations[row],
             )  # fmt: skip
             if trace.shape[1] > 0:
-                copy(memory, trace[row, progress[row]])
+                copy(record, trace[row, progress[row]])
             progress[row] += 1
-            count(memory, before_a, before_delta, period, tally[row])
+            count(record, before_a, before_delta, period, tally[row])
             passed(watched[row])
         if until_band and asked[row] == ASKED and ends[row] == k.RUNNING:
             attend(
@@ -225,7 +225,7 @@ def drive_rows(
 
 @compiled
 def drive_rows_under_conditions(
-    first: int, last: int, periods: int, memories: Array, observations: Array, ends: Array,
+    first: int, last: int, periods: int, records: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
     feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
     watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
@@ -238,12 +238,12 @@ def drive_rows_under_conditions(
     for row in range(first, last):
         if asked[row] == HELD or asked[row] == PAUSED:
             continue
-        memory, case = memories[row], cases[row]
+        record, case = records[row], cases[row]
         table = tables[rows[case, 0] : rows[case, 1]]
         period = env_constants[case, k.PERIOD]
         while progress[row] < periods and ends[row] == k.RUNNING:
             free_at = vehicles[row, conditions_layout.FREE_AT]
-            if free_at > memory[k.STEPS] * period + conditions_layout.INSTANT:
+            if free_at > record[k.STEPS] * period + conditions_layout.INSTANT:
                 # Busy with an earlier command: nothing is computed, the last one stays.
                 remember(commands[row], commands[row, 0, 0], commands[row, 0, 1])
             else:
@@ -255,15 +255,15 @@ def drive_rows_under_conditions(
                 )  # fmt: skip
                 if asked[row] != ASKED:
                     break
-            before_a, before_delta = memory[k.ACCELERATION], memory[k.STEERING]
+            before_a, before_delta = record[k.ACCELERATION], record[k.STEERING]
             ends[row] = drive_under_conditions(
-                vehicles[row], memory, actions[row, 0], actions[row, 1], specs[case],
+                vehicles[row], record, actions[row, 0], actions[row, 1], specs[case],
                 env_constants[case], table, observations[row], draws[row, 0], draws[row, 1], work,
             )  # fmt: skip
             if trace.shape[1] > 0:
-                copy(memory, trace[row, progress[row]])
+                copy(record, trace[row, progress[row]])
             progress[row] += 1
-            count(memory, before_a, before_delta, period, tally[row])
+            count(record, before_a, before_delta, period, tally[row])
             passed(watched[row])
         if until_band and asked[row] == ASKED and ends[row] == k.RUNNING:
             attend(
@@ -274,7 +274,7 @@ def drive_rows_under_conditions(
 
 @compiled_parallel
 def drive_in_threads(
-    chunks: int, n: int, periods: int, memories: Array, observations: Array, ends: Array,
+    chunks: int, n: int, periods: int, records: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
     feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
     watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
@@ -286,7 +286,7 @@ def drive_in_threads(
     """`drive_rows` on all n, in chunks that threads share; each has its own working space."""
     for chunk in numba.prange(chunks):
         drive_rows(
-            chunk * n // chunks, (chunk + 1) * n // chunks, periods, memories, observations, ends,
+            chunk * n // chunks, (chunk + 1) * n // chunks, periods, records, observations, ends,
             cases, env_constants, tables, rows, looked, commands, feet, future, weight_tables,
             rules, bands, weights, watched, until_band, since, network, layers, sets, matrix,
             log_span, catalogue, scales, window, constants, plans, flags, told, states, actions,
@@ -297,7 +297,7 @@ def drive_in_threads(
 
 @compiled_parallel
 def drive_in_threads_under_conditions(
-    chunks: int, n: int, periods: int, memories: Array, observations: Array, ends: Array,
+    chunks: int, n: int, periods: int, records: Array, observations: Array, ends: Array,
     cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
     feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
     watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
@@ -309,7 +309,7 @@ def drive_in_threads_under_conditions(
     """`drive_in_threads` under conditions."""
     for chunk in numba.prange(chunks):
         drive_rows_under_conditions(
-            chunk * n // chunks, (chunk + 1) * n // chunks, periods, memories, observations, ends,
+            chunk * n // chunks, (chunk + 1) * n // chunks, periods, records, observations, ends,
             cases, env_constants, tables, rows, looked, commands, feet, future, weight_tables,
             rules, bands, weights, watched, until_band, since, network, layers, sets, matrix,
             log_span, catalogue, scales, window, constants, plans, flags, told, states, actions,

@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from lpv_track_env.kernels import PREVIEW_START
+from lpv_track_env.observation import PREVIEW_START
 from trajectories.compilation import compiled_internal
 
 Array = NDArray[Any]

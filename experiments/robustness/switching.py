@@ -183,7 +183,7 @@ class Branches:
             sums += np.where(running, tally[:, chosen], 0.0)
             largest = np.fmax(largest, np.where(running, Tally(*tally).max_lateral[chosen], 0.0))
             nmpc = loop.memory.nmpc
-            numbers = [loop.envs.memories[chosen], nmpc.actions[chosen], nmpc.weights[chosen]]
+            numbers = [loop.envs.records[chosen], nmpc.actions[chosen], nmpc.weights[chosen]]
             not_finite |= ~np.isfinite(np.concatenate(numbers, axis=1)).all(axis=1)
             used[running, window] = np.log(nmpc.weights[chosen, :TUNED] / self.base[:TUNED])[
                 running

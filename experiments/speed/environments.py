@@ -181,7 +181,7 @@ def numpy_vector(n: int) -> Run:
     actions = _actions(n).astype(np.float64)
 
     def run(count: int) -> float:
-        yardstick = NumpyTracking(env.tasks[0], env.memories)
+        yardstick = NumpyTracking(env.tasks[0], env.records)
         step = yardstick.step
         chosen = list(islice(cycle(actions), count))
         began = time.perf_counter()

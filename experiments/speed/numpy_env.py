@@ -29,8 +29,8 @@ class NumpyTracking:
     ----------
     task
         What all of them drive.
-    memories
-        (n, `kernels.MEMORY_SIZE`), as a `PathTrackingVectorEnv` holds them; copied.
+    records
+        (n, `kernels.RECORD_SIZE`), as a `PathTrackingVectorEnv` holds them; copied.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class NumpyTracking:
         (n,) of the last step, m, m, rad, m/s.
     """
 
-    def __init__(self, task: Task, memories: Array) -> None:
+    def __init__(self, task: Task, records: Array) -> None:
         self.task = task
         path = task.path
         self._h, self._length, self._closed = path.spacing, path.length, path.closed
@@ -49,7 +49,7 @@ class NumpyTracking:
         self._curvature, self._speed, self._time = path.curvature, path.speed, path.time
         self._cells = len(path.x) - 1
         self._turn = path.heading[-1] - path.heading[0]
-        rows = memories.T.copy()
+        rows = records.T.copy()
         self.state = rows[:6]
         self._command = rows[[k.ACCELERATION, k.STEERING]]
         self.arc_length, self._start, self._steps = rows[k.ARC_LENGTH], rows[k.START], rows[k.STEPS]

@@ -116,8 +116,8 @@ class Judge:
         loop = loop_with(result, envs, by_path=by_path)
         loop.reset(seed=0)
         limit = envs.single.task.max_steps
-        trace = np.full((envs.num_envs, limit, k.MEMORY_SIZE), np.nan)
-        before = envs.memories.copy()
+        trace = np.full((envs.num_envs, limit, k.RECORD_SIZE), np.nan)
+        before = envs.records.copy()
         tally = loop.drive(limit, trace=trace)
         trace = np.concatenate([before[:, None], trace], axis=1)
         path = envs.single.task.path
@@ -137,7 +137,7 @@ def loop_with(result: Result, envs: PathTrackingVectorEnv, *, by_path: bool = Fa
 
 
 def figures_of(tally: Tally, envs: PathTrackingVectorEnv, trace: Array) -> dict[str, Array]:
-    """Figures of drives that have ended, (n,) each; `trace` (n, 1 + periods, MEMORY_SIZE)."""
+    """Figures of drives that have ended, (n,) each; `trace` (n, 1 + periods, RECORD_SIZE)."""
     ends, car, period = envs.arrays.ends, envs.single.vehicle, envs.single.control_period
     parts, steps = parts_of(tally), np.maximum(tally.steps, 1.0)
     driven = np.isfinite(trace[:, 1:, 0])

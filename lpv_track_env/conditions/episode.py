@@ -31,11 +31,11 @@ Array = NDArray[Any]
 
 
 @compiled_in_place
-def take_command(m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array) -> int:
+def take_command(m: Array, record: Array, a: Any, delta: Any, spec: Array, constants: Array) -> int:
     """Begin a control period: send its command, if it can be; the bits of what was clipped."""
     p, queue = constants, m[layout.TAIL : layout.ways_start(spec)]
-    filter_memory = m[layout.filter_start(spec) :]
-    now = memory[k.STEPS] * p[k.PERIOD]
+    ekf = m[layout.filter_start(spec) :]
+    now = record[k.STEPS] * p[k.PERIOD]
     bits = 0
     if m[layout.FREE_AT] > now + layout.INSTANT:
         # The controller is still busy with an earlier command: it misses its turn.
@@ -50,11 +50,10 @@ def take_command(m: Array, memory: Array, a: Any, delta: Any, spec: Array, const
             periods * p[k.ACCELERATION_STEP],
         )  # fmt: skip
         m[layout.MISSED_IN_A_ROW] = 0.0
-        send(m, queue, now, a, delta, offset_of(filter_memory, spec))
+        send(m, queue, now, a, delta, offset_of(ekf, spec))
     m[layout.LATENCY] = m[layout.OCCUPIED] = -1.0
     blind = (
-        spec[layout.ESTIMATOR] == layout.EKF
-        and filter_memory[filtering.FIX_AGE] > spec[layout.MAX_FIX_AGE]
+        spec[layout.ESTIMATOR] == layout.EKF and ekf[filtering.FIX_AGE] > spec[layout.MAX_FIX_AGE]
     )
     stale = command_age(m, queue, now) > spec[layout.MAX_COMMAND_AGE] + layout.INSTANT
     m[layout.STOPPING] = 0.0
@@ -67,42 +66,42 @@ def take_command(m: Array, memory: Array, a: Any, delta: Any, spec: Array, const
 
 @compiled_in_place
 def end_period(
-    m: Array, memory: Array, vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, bits: int,
+    m: Array, record: Array, vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, bits: int,
     spec: Array, constants: Array, table: Array, observation: Array, key: Any, episode: Any,
     work: Array,
 ) -> int:  # fmt: skip
     """End a control period with a new state: errors, end, reward, sensors, estimate."""
     p, filtered = constants, layout.filter_start(spec)
-    ways, filter_memory = m[layout.ways_start(spec) : filtered], m[filtered:]
+    ways, ekf = m[layout.ways_start(spec) : filtered], m[filtered:]
     end = k.finish(
-        memory, p, table, observation, vx, vy, psi, r, x, y, m[layout.SERVO_A],
+        record, p, table, observation, vx, vy, psi, r, x, y, m[layout.SERVO_A],
         m[layout.SERVO_DELTA], bits,
     )  # fmt: skip
     if end == k.NON_FINITE:
         # What was seen last stays: there is no state that sensors could read.
         return end
-    now = memory[k.STEPS] * p[k.PERIOD]
-    draw = PERIOD_DRAW + DRAWS * int(memory[k.STEPS])
-    read_sensors(m, memory, key, episode, draw, p[k.PERIOD])
-    receive_satellites(m, ways, memory, now, key, episode, draw, spec)
-    estimate(m, ways, filter_memory, memory, now, spec, work)
+    now = record[k.STEPS] * p[k.PERIOD]
+    draw = PERIOD_DRAW + DRAWS * int(record[k.STEPS])
+    read_sensors(m, record, key, episode, draw, p[k.PERIOD])
+    receive_satellites(m, ways, record, now, key, episode, draw, spec)
+    estimate(m, ways, ekf, record, now, spec, work)
     see(m, p, table, observation, vx * p[k.PERIOD])
     return end
 
 
 @compiled_in_place
 def drive_under_conditions(
-    m: Array, memory: Array, a: Any, delta: Any, spec: Array, constants: Array, table: Array,
+    m: Array, record: Array, a: Any, delta: Any, spec: Array, constants: Array, table: Array,
     observation: Array, key: Any, episode: Any, work: Array,
 ) -> int:  # fmt: skip
     """One control period of an episode under conditions, in place; the code of its end."""
-    bits = take_command(m, memory, a, delta, spec, constants)
+    bits = take_command(m, record, a, delta, spec, constants)
     period = constants[k.PERIOD]
-    blow(m, key, episode, PERIOD_DRAW + DRAWS * (int(memory[k.STEPS]) + 1), period)
+    blow(m, key, episode, PERIOD_DRAW + DRAWS * (int(record[k.STEPS]) + 1), period)
     queue = m[layout.TAIL : layout.ways_start(spec)]
-    vx, vy, psi, r, x, y = move(m, queue, memory, constants, memory[k.STEPS] * period)
+    vx, vy, psi, r, x, y = move(m, queue, record, constants, record[k.STEPS] * period)
     return end_period(
-        m, memory, vx, vy, psi, r, x, y, bits, spec, constants, table, observation, key, episode,
+        m, record, vx, vy, psi, r, x, y, bits, spec, constants, table, observation, key, episode,
         work,
     )  # fmt: skip
 
@@ -117,7 +116,7 @@ def see(m: Array, constants: Array, table: Array, observation: Array, ahead: Any
 
 @compiled
 def begin_under_conditions(
-    m: Array, memory: Array, spec: Array, constants: Array, table: Array, observation: Array,
+    m: Array, record: Array, spec: Array, constants: Array, table: Array, observation: Array,
     draws: Array, given: Array,
 ) -> None:  # fmt: skip
     """Begin an episode under conditions: draw them and the start, `given` as `episodes.begin`.
@@ -125,7 +124,7 @@ def begin_under_conditions(
     `draws` holds key and number of the episode, (2,) uint64.
     """
     key, episode = draws[0], draws[1]
-    begin(memory, constants, table, observation, key, episode, given)
+    begin(record, constants, table, observation, key, episode, given)
     for j in range(m.shape[0]):
         m[j] = 0.0
     draw_conditions(m, spec, key, episode)
@@ -137,17 +136,17 @@ def begin_under_conditions(
     m[layout.PLANT + 5] *= m[layout.REAR_STIFFNESS_FACTOR]
     m[layout.PLANT + 6] *= m[layout.ROLLING_FACTOR]
     m[layout.LATENCY] = m[layout.OCCUPIED] = -1.0
-    m[layout.SERVO_A], m[layout.SERVO_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]
-    m[layout.COMMAND_A], m[layout.COMMAND_DELTA] = memory[k.ACCELERATION], memory[k.STEERING]
+    m[layout.SERVO_A], m[layout.SERVO_DELTA] = record[k.ACCELERATION], record[k.STEERING]
+    m[layout.COMMAND_A], m[layout.COMMAND_DELTA] = record[k.ACCELERATION], record[k.STEERING]
     m[layout.TAIL] = 0.0
-    m[layout.TAIL + 1], m[layout.TAIL + 2] = memory[k.ACCELERATION], memory[k.STEERING]
+    m[layout.TAIL + 1], m[layout.TAIL + 2] = record[k.ACCELERATION], record[k.STEERING]
     m[layout.QUEUED] = 1.0
-    begin_estimate(m, m[layout.filter_start(spec) :], memory, key, episode, PERIOD_DRAW, spec)
+    begin_estimate(m, m[layout.filter_start(spec) :], record, key, episode, PERIOD_DRAW, spec)
     e = m[layout.ESTIMATE : layout.TAIL]
-    e[k.ACCELERATION], e[k.STEERING] = memory[k.ACCELERATION], memory[k.STEERING]
+    e[k.ACCELERATION], e[k.STEERING] = record[k.ACCELERATION], record[k.STEERING]
     if spec[layout.ESTIMATOR] == layout.TRUTH:
         e[k.STEERING] += m[layout.STEERING_OFFSET]
-    e[k.ARC_LENGTH] = memory[k.ARC_LENGTH]
+    e[k.ARC_LENGTH] = record[k.ARC_LENGTH]
     see(m, constants, table, observation, 0.0)
 
 
@@ -160,7 +159,7 @@ def advance_under_conditions(
     `draws` holds key and number of the episode, (2,) uint64.
     """
     a, delta = data[0], data[1]
-    c = data[k.MEMORY : k.CONSTANTS]
+    c = data[k.RECORD : k.CONSTANTS]
     if math.isfinite(a) and math.isfinite(delta):
         end = drive_under_conditions(
             m, c, a, delta, spec, data[k.CONSTANTS : k.OBSERVATION], table,
@@ -182,10 +181,10 @@ def command_under_conditions(data: Array, m: Array, spec: Array) -> tuple[Any, A
     Returns the mean acceleration that the drive gives over it (m/s^2), the angle at which the
     wheels stand at its end (rad), and the bits of what was clipped.
     """
-    memory, constants = data[k.MEMORY : k.CONSTANTS], data[k.CONSTANTS : k.OBSERVATION]
-    bits = take_command(m, memory, data[0], data[1], spec, constants)
+    record, constants = data[k.RECORD : k.CONSTANTS], data[k.CONSTANTS : k.OBSERVATION]
+    bits = take_command(m, record, data[0], data[1], spec, constants)
     queue = m[layout.TAIL : layout.ways_start(spec)]
-    substeps, now = int(constants[k.SUBSTEPS]), memory[k.STEPS] * constants[k.PERIOD]
+    substeps, now = int(constants[k.SUBSTEPS]), record[k.STEPS] * constants[k.PERIOD]
     h = constants[k.PERIOD] / substeps
     braking = stop_acceleration(m, constants)
     m[layout.MEAN_A] = m[layout.MEAN_DELTA] = 0.0
@@ -203,7 +202,7 @@ def conclude_under_conditions(
 ) -> int:  # fmt: skip
     """End a control period that another plant has driven to a `state` (6,)."""
     return end_period(
-        m, data[k.MEMORY : k.CONSTANTS], state[0], state[1], state[2], state[3], state[4],
+        m, data[k.RECORD : k.CONSTANTS], state[0], state[1], state[2], state[3], state[4],
         state[5], bits, spec, data[k.CONSTANTS : k.OBSERVATION], table,
         data[k.OBSERVATION :].view(np.float32), draws[0], draws[1], work,
     )  # fmt: skip

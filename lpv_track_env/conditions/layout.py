@@ -45,7 +45,7 @@ stop, deadline misses in all and in a row, mean reported inputs over the last pe
 direction and gust, GNSS, the readings of this period;"""
 ESTIMATE = PLANT + len(PARAMETER_ORDER) + 29
 """the estimate, a memory as `kernels` has it;"""
-TAIL = ESTIMATE + kernels.MEMORY_SIZE
+TAIL = ESTIMATE + kernels.RECORD_SIZE
 """commands on their way (landing time s, a, delta), fixes on theirs (arrival s, stamp, x, y), and
 the filter with its past."""
 COMMAND, WAY = 3, 4
@@ -96,7 +96,7 @@ def rooms(conditions: Conditions, period: float) -> tuple[int, int, int]:
     )
 
 
-def memory_size(conditions: Conditions, period: float) -> int:
+def vehicle_size(conditions: Conditions, period: float) -> int:
     """Length of a vehicle's array under some conditions and a control period (s)."""
     commands, fixes, nodes = rooms(conditions, period)
     return TAIL + COMMAND * commands + WAY * fixes + filtering.FILTER + filtering.NODE * nodes
@@ -127,7 +127,7 @@ def spec_of(conditions: Conditions, vehicle: VehicleParameters, period: float) -
 class ConditionsArrays(NamedTuple):
     """What the kernels take of one vehicle under conditions."""
 
-    memory: Array
+    vehicle: Array
     spec: Array
     work: Array
     """Working space of the filter."""
@@ -138,14 +138,14 @@ class ConditionsArrays(NamedTuple):
         if task.conditions is None:
             return None
         return cls(
-            np.zeros(memory_size(task.conditions, task.control_period)),
+            np.zeros(vehicle_size(task.conditions, task.control_period)),
             spec_of(task.conditions, task.vehicle, task.control_period),
             np.zeros(filtering.WORK),
         )
 
     def busy_at(self, now: float) -> bool:
         """Whether the controller still computes an earlier command at `now` (s)."""
-        return bool(self.memory[FREE_AT] > now + INSTANT)
+        return bool(self.vehicle[FREE_AT] > now + INSTANT)
 
     def set_computing_time(self, latency: float, occupied: float) -> None:
         """Set latency and occupation of the next computation, s.
@@ -157,11 +157,11 @@ class ConditionsArrays(NamedTuple):
         """
         if not (0.0 <= latency <= LONGEST_DELAY and 0.0 <= occupied <= LONGEST_DELAY):
             raise ValueError(f"computing times must be 0 to {LONGEST_DELAY:g} s")
-        self.memory[LATENCY], self.memory[OCCUPIED] = latency, occupied
+        self.vehicle[LATENCY], self.vehicle[OCCUPIED] = latency, occupied
 
     def info(self) -> dict[str, Any]:
         """What infos have besides those of ideal conditions."""
-        return single_report(self.memory[list(REPORTED)])
+        return single_report(self.vehicle[list(REPORTED)])
 
 
 REPORTED = (*range(ESTIMATE, ESTIMATE + 6), DEVIATION, STOPPING, MISSES)

@@ -43,22 +43,22 @@ def draw_conditions(m: Array, spec: Array, key: Any, episode: Any) -> None:
 
 
 @compiled_internal
-def read_sensors(m: Array, memory: Array, key: Any, episode: Any, draw: int, period: Any) -> None:
+def read_sensors(m: Array, record: Array, key: Any, episode: Any, draw: int, period: Any) -> None:
     """Read wheel speed, yaw rate and heading of the true state."""
     first, second = gaussian(key, episode, draw + READINGS_DRAW)
     third, _ = gaussian(key, episode, draw + READINGS_DRAW + 2)
     walk, _ = gaussian(key, episode, draw + DRIFT_DRAW)
     m[layout.DRIFT] += m[layout.YAW_RATE_DRIFT] * math.sqrt(period) * walk
     m[layout.READ_SPEED] = (
-        memory[VX] * (1.0 + m[layout.SPEED_SCALE]) + m[layout.SPEED_NOISE] * first
+        record[VX] * (1.0 + m[layout.SPEED_SCALE]) + m[layout.SPEED_NOISE] * first
     )
     m[layout.READ_YAW_RATE] = (
-        memory[YAW_RATE]
+        record[YAW_RATE]
         + m[layout.YAW_RATE_BIAS]
         + m[layout.DRIFT]
         + m[layout.YAW_RATE_NOISE] * second
     )
-    m[layout.READ_HEADING] = memory[PSI] + m[layout.HEADING_BIAS] + m[layout.HEADING_NOISE] * third
+    m[layout.READ_HEADING] = record[PSI] + m[layout.HEADING_BIAS] + m[layout.HEADING_NOISE] * third
 
 
 @compiled_internal
@@ -96,14 +96,14 @@ def measure_fix(
 
 @compiled_internal
 def receive_satellites(
-    m: Array, ways: Array, memory: Array, now: Any, key: Any, episode: Any, draw: int, spec: Array
+    m: Array, ways: Array, record: Array, now: Any, key: Any, episode: Any, draw: int, spec: Array
 ) -> None:
     """Make the fix that is due, if there is one, and put it on its way."""
     if now < m[layout.NEXT_FIX] - 1e-9:
         return
     spacing = spec[layout.GNSS_PERIOD]
     m[layout.NEXT_FIX] = max(m[layout.NEXT_FIX] + spacing, now + 1e-6)
-    there, x, y = measure_fix(m, memory[X], memory[Y], spacing, now, key, episode, draw)
+    there, x, y = measure_fix(m, record[X], record[Y], spacing, now, key, episode, draw)
     at = int(m[layout.WAITING])
     if there and (at + 1) * layout.WAY <= ways.shape[0]:
         place = at * layout.WAY
@@ -127,17 +127,17 @@ def drop_first(m: Array, ways: Array) -> None:
 
 
 @compiled_internal
-def offset_of(filter_memory: Array, spec: Array) -> Any:
+def offset_of(ekf: Array, spec: Array) -> Any:
     """Steering offset that is taken off the commands, rad."""
     if spec[layout.CALIBRATE] < 0.5 or spec[layout.ESTIMATOR] != layout.EKF:
         return 0.0
-    offset = filter_memory[filtering.STEERING_OFFSET]
+    offset = ekf[filtering.STEERING_OFFSET]
     return clip(offset, -layout.WORST_OFFSET, layout.WORST_OFFSET)
 
 
 @compiled_in_place
 def estimate(
-    m: Array, ways: Array, filter_memory: Array, memory: Array, now: Any, spec: Array, work: Array
+    m: Array, ways: Array, ekf: Array, record: Array, now: Any, spec: Array, work: Array
 ) -> None:
     """Make the estimate of this control period's end from what was read and what has arrived."""
     e = m[layout.ESTIMATE : layout.TAIL]
@@ -145,42 +145,40 @@ def estimate(
     if kind == layout.EKF:
         settings = spec[layout.SETTINGS :]
         filtering.advance_filter(
-            filter_memory, now, m[layout.MEAN_A], m[layout.MEAN_DELTA], m[layout.READ_SPEED],
+            ekf, now, m[layout.MEAN_A], m[layout.MEAN_DELTA], m[layout.READ_SPEED],
             m[layout.READ_YAW_RATE], m[layout.READ_HEADING], settings, work,
         )  # fmt: skip
     while arrived(m, ways, now):
         m[layout.FIX_X], m[layout.FIX_Y] = ways[2], ways[3]
         if kind == layout.EKF:
-            filtering.take_fix(
-                filter_memory, ways[1], ways[2], ways[3], spec[layout.SETTINGS :], work
-            )
+            filtering.take_fix(ekf, ways[1], ways[2], ways[3], spec[layout.SETTINGS :], work)
         drop_first(m, ways)
     e[ACCELERATION] = m[layout.SERVO_A]
-    e[STEERING] = m[layout.SERVO_DELTA] + offset_of(filter_memory, spec)
+    e[STEERING] = m[layout.SERVO_DELTA] + offset_of(ekf, spec)
     if kind == layout.EKF:
         for j in range(6):
-            e[j] = filter_memory[j]
-        m[layout.DEVIATION] = filtering.position_deviation(filter_memory)
+            e[j] = ekf[j]
+        m[layout.DEVIATION] = filtering.position_deviation(ekf)
     elif kind == layout.RAW:
         e[VX], e[VY], e[YAW_RATE] = m[layout.READ_SPEED], 0.0, m[layout.READ_YAW_RATE]
         e[PSI], e[X], e[Y] = m[layout.READ_HEADING], m[layout.FIX_X], m[layout.FIX_Y]
     else:
         for j in range(6):
-            e[j] = memory[j]
+            e[j] = record[j]
         e[STEERING] = m[layout.SERVO_DELTA] + m[layout.STEERING_OFFSET]
 
 
 @compiled_in_place
 def begin_estimate(
-    m: Array, filter_memory: Array, memory: Array, key: Any, episode: Any, draw: int, spec: Array
+    m: Array, ekf: Array, record: Array, key: Any, episode: Any, draw: int, spec: Array
 ) -> None:
     """Begin from a first fix, heading and speed, read on the spot (at 0 s); no outlier."""
     kind = int(spec[layout.ESTIMATOR])
     e = m[layout.ESTIMATE : layout.TAIL]
-    m[layout.FIX_X], m[layout.FIX_Y] = sound_fix(m, memory[X], memory[Y], key, episode, draw)
-    read_sensors(m, memory, key, episode, draw, 0.0)
+    m[layout.FIX_X], m[layout.FIX_Y] = sound_fix(m, record[X], record[Y], key, episode, draw)
+    read_sensors(m, record, key, episode, draw, 0.0)
     for j in range(6):
-        e[j] = memory[j]
+        e[j] = record[j]
     m[layout.DEVIATION] = 0.0
     if kind == layout.TRUTH:
         return
@@ -188,7 +186,7 @@ def begin_estimate(
     e[PSI], e[X], e[Y] = m[layout.READ_HEADING], m[layout.FIX_X], m[layout.FIX_Y]
     if kind == layout.RAW:
         return
-    f = filter_memory
+    f = ekf
     for j in range(filtering.TIME):
         f[j] = 0.0
     for j in range(6):

@@ -21,7 +21,7 @@ Array = NDArray[Any]
 
 @compiled_internal
 def begin_next(
-    i: int, m: Array, memory: Array, cases: Array, drawn: Any, specs: Array, constants: Array,
+    i: int, m: Array, record: Array, cases: Array, drawn: Any, specs: Array, constants: Array,
     tables: Array, rows: Array, observation: Array, draws: Array, given: Array,
 ) -> None:  # fmt: skip
     """`vector_kernels.begin_next` under conditions; `draws` holds key and episode, (2,)."""
@@ -30,16 +30,16 @@ def begin_next(
     cases[i] = case
     table = tables[rows[case, 0] : rows[case, 1]]
     begin_under_conditions(
-        m, memory, specs[case], constants[case], table, observation, draws, given
+        m, record, specs[case], constants[case], table, observation, draws, given
     )
 
 
 @compiled
 def advance(
     first: int, last: int, mode: int,
-    memories: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
+    records: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
     rows: Array, given: Array, observations: Array, ends: Array, rewards: Array,
-    final_memories: Array, final_observations: Array,
+    final_records: Array, final_observations: Array,
     vehicles: Array, specs: Array, draws: Array, final_reports: Array, work: Array,
 ) -> None:  # fmt: skip
     """One control period of the environments `first` to `last` - 1, as `vector_kernels.advance`.
@@ -48,20 +48,20 @@ def advance(
     (n, 2) uint64 key and episode of each; `work` is the filter's.
     """
     for i in range(first, last):
-        memory, observation, m = memories[i], observations[i], vehicles[i]
+        record, observation, m = records[i], observations[i], vehicles[i]
         begins = mode == NEXT_STEP and ends[i] != k.RUNNING
         if begins:
             ends[i], rewards[i] = k.RUNNING, 0.0
         else:
             case = cases[i]
             ends[i] = drive_under_conditions(
-                m, memory, actions[i, 0], actions[i, 1], specs[case], constants[case],
+                m, record, actions[i, 0], actions[i, 1], specs[case], constants[case],
                 tables[rows[case, 0] : rows[case, 1]], observation, draws[i, 0], draws[i, 1], work,
             )  # fmt: skip
-            rewards[i] = memory[k.REWARD]
+            rewards[i] = record[k.REWARD]
             if mode == SAME_STEP and ends[i] != k.RUNNING:
                 begins = True
-                copy(memory, final_memories[i])
+                copy(record, final_records[i])
                 copy(observation, final_observations[i])
                 for j in range(6):
                     final_reports[i, j] = m[layout.ESTIMATE + j]
@@ -69,7 +69,7 @@ def advance(
                 final_reports[i, 7], final_reports[i, 8] = m[layout.STOPPING], m[layout.MISSES]
         if begins:
             begin_next(
-                i, m, memory, cases, drawn, specs, constants, tables, rows, observation,
+                i, m, record, cases, drawn, specs, constants, tables, rows, observation,
                 draws[i], given,
             )  # fmt: skip
 
@@ -77,23 +77,23 @@ def advance(
 @compiled_parallel
 def advance_in_threads(
     chunks: int, n: int, mode: int,
-    memories: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
+    records: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
     rows: Array, given: Array, observations: Array, ends: Array, rewards: Array,
-    final_memories: Array, final_observations: Array,
+    final_records: Array, final_observations: Array,
     vehicles: Array, specs: Array, draws: Array, final_reports: Array, work: Array,
 ) -> None:  # fmt: skip
     """`advance` on all n environments, in chunks that threads share, each with a row of `work`."""
     for chunk in numba.prange(chunks):
         advance(
-            chunk * n // chunks, (chunk + 1) * n // chunks, mode, memories, actions, cases, drawn,
-            constants, tables, rows, given, observations, ends, rewards, final_memories,
+            chunk * n // chunks, (chunk + 1) * n // chunks, mode, records, actions, cases, drawn,
+            constants, tables, rows, given, observations, ends, rewards, final_records,
             final_observations, vehicles, specs, draws, final_reports, work[chunk],
         )  # fmt: skip
 
 
 @compiled
 def begin_all(
-    mask: Array, memories: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
+    mask: Array, records: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
     rows: Array, given: Array, observations: Array, ends: Array, vehicles: Array, specs: Array,
     draws: Array,
 ) -> None:  # fmt: skip
@@ -102,7 +102,7 @@ def begin_all(
         if mask[i]:
             ends[i] = k.RUNNING
             begin_next(
-                i, vehicles[i], memories[i], cases, drawn, specs, constants, tables, rows,
+                i, vehicles[i], records[i], cases, drawn, specs, constants, tables, rows,
                 observations[i], draws[i], given,
             )  # fmt: skip
 
@@ -124,7 +124,7 @@ class ConditionsVector:
 
     def __init__(self, conditions: Conditions, num_envs: int, period: float, threads: int) -> None:
         self._conditions, self._period, self._threads = conditions, period, threads
-        self.vehicles = np.zeros((num_envs, layout.memory_size(conditions, period)))
+        self.vehicles = np.zeros((num_envs, layout.vehicle_size(conditions, period)))
         self.draws = np.zeros((num_envs, 2), dtype=np.uint64)
         self._final_reports = np.zeros((num_envs, len(layout.REPORTED)))
         self._work = np.zeros((shares(threads), filtering.WORK))
@@ -142,7 +142,7 @@ class ConditionsVector:
         return self.vehicles, self.specs, self.draws
 
     def advance(self, mode: int, keys: Array, episodes: Array, arguments: Any) -> None:
-        """Drive a control period; `arguments` are `advance`'s from `memories` on."""
+        """Drive a control period; `arguments` are `advance`'s from `records` on."""
         self.draws[:, 0], self.draws[:, 1] = keys, episodes
         n = len(self.draws)
         shared = (mode, *arguments, self.vehicles, self.specs, self.draws, self._final_reports)

@@ -162,14 +162,14 @@ def serve(m: Array, queue: Array, braking: Any, begins: Any, h: Any) -> tuple[An
 
 @compiled_in_place
 def move(
-    m: Array, queue: Array, memory: Array, constants: Array, now: Any
+    m: Array, queue: Array, record: Array, constants: Array, now: Any
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
     """State after a control period of the real vehicle; notes servos and mean inputs in `m`."""
     p, q = constants, layout.PLANT
     substeps = int(p[k.SUBSTEPS])
     h = p[k.PERIOD] / substeps
-    vx, vy, psi, r = memory[VX], memory[VY], memory[PSI], memory[YAW_RATE]
-    x, y = memory[X], memory[Y]
+    vx, vy, psi, r = record[VX], record[VY], record[PSI], record[YAW_RATE]
+    x, y = record[X], record[Y]
     load = m[q] * GRAVITY / (m[q + 2] + m[q + 3]) * m[layout.FRICTION]
     total_a = total_delta = 0.0
     windy = m[layout.WIND_SPEED] > 0.0 or m[layout.GUST_SPEED] > 0.0

@@ -164,7 +164,7 @@ class Estimator:
         self.vehicle, self.settings = vehicle, settings or EstimatorSettings()
         self._settings = self.settings.as_array(vehicle)
         nodes = math.ceil(memory / period - 1e-9) + 1
-        self._memory = np.zeros(filtering.FILTER + nodes * filtering.NODE)
+        self._filter = np.zeros(filtering.FILTER + nodes * filtering.NODE)
         self._work = np.zeros(filtering.WORK)
         self._begun = False
 
@@ -178,7 +178,7 @@ class Estimator:
         """
         if not all(map(math.isfinite, (time, x, y, heading, speed))):
             raise ValueError("the estimator must begin from finite readings")
-        m, states = self._memory, filtering.STATES
+        m, states = self._filter, filtering.STATES
         m[:states] = [speed, 0.0, heading, 0.0, x, y, 0.0, 0.0, 0.0]
         covariance = np.diag(self.settings.initial_variances)
         # The heading was read: its error is that of the bias, with the other sign.
@@ -220,7 +220,7 @@ class Estimator:
         if time < self.time:
             raise ValueError(f"time goes back: from {self.time} to {time} s")
         filtering.advance_filter(
-            self._memory, float(time), float(acceleration), float(steering_angle), float(speed),
+            self._filter, float(time), float(acceleration), float(steering_angle), float(speed),
             float(yaw_rate), float(heading), self._settings, self._work,
         )  # fmt: skip
 
@@ -235,7 +235,7 @@ class Estimator:
         """
         self._check_begun()
         code = filtering.take_fix(
-            self._memory, float(stamp), float(x), float(y), self._settings, self._work
+            self._filter, float(stamp), float(x), float(y), self._settings, self._work
         )
         return filtering.FIX_RESULTS[code]
 
@@ -246,43 +246,43 @@ class Estimator:
     @property
     def time(self) -> float:
         """Time of the estimate, s."""
-        return float(self._memory[filtering.TIME])
+        return float(self._filter[filtering.TIME])
 
     @property
     def state(self) -> Array:
         """Estimate of [vx, vy, psi, r, X, Y], (6,), a copy."""
-        return self._memory[:6].copy()
+        return self._filter[:6].copy()
 
     @property
     def biases(self) -> Array:
         """Estimates of yaw-rate bias (rad/s), heading bias and steering offset (rad), (3,)."""
-        return self._memory[6:9].copy()
+        return self._filter[6:9].copy()
 
     @property
     def covariance(self) -> Array:
         """Covariance of state and biases, (9, 9), a copy."""
         first = filtering.COVARIANCE
-        return self._memory[first : first + 81].reshape(9, 9).copy()
+        return self._filter[first : first + 81].reshape(9, 9).copy()
 
     @property
     def position_deviation(self) -> float:
         """Standard deviation of the position in its worst direction, m."""
-        return float(filtering.deviation_of(self._memory, 0))
+        return float(filtering.deviation_of(self._filter, 0))
 
     @property
     def fix_age(self) -> float:
         """Time since the last fix that was used, s."""
-        return float(self._memory[filtering.FIX_AGE])
+        return float(self._filter[filtering.FIX_AGE])
 
     @property
     def fix_nis(self) -> float:
         """Normalised innovation squared of the last fix (2 degrees of freedom); NaN before one."""
-        return float(self._memory[filtering.FIX_NIS])
+        return float(self._filter[filtering.FIX_NIS])
 
     @property
     def reading_nis(self) -> tuple[float, int]:
         """NIS of the last call's other readings together, and how many these were."""
-        m = self._memory
+        m = self._filter
         return float(m[filtering.READING_NIS]), int(m[filtering.READINGS])
 
     @property
@@ -299,4 +299,4 @@ class Estimator:
             "yaw_rates_gated": f.YAW_RATE_GATED,
             "headings_gated": f.HEADING_GATED,
         }
-        return {name: int(self._memory[row]) for name, row in rows.items()}
+        return {name: int(self._filter[row]) for name, row in rows.items()}

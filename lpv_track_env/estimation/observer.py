@@ -28,7 +28,7 @@ class PathObserver:
 
     def __init__(self, path: ReferencePath, layout: ObservationLayout) -> None:
         self.path, self.layout = path, layout
-        self._memory = np.zeros(kernels.MEMORY_SIZE)
+        self._record = np.zeros(kernels.RECORD_SIZE)
         self._observation = np.zeros(layout.size, dtype=np.float32)
         self._constants = np.zeros(kernels.CONSTANTS_SIZE)
         self._constants[kernels.LENGTH] = path.length
@@ -41,7 +41,7 @@ class PathObserver:
         values = np.asarray(state, dtype=np.float64)
         x, y = float(values[4]), float(values[5])
         arc = self.path.project(x, y, near=near).arc_length
-        self._memory[kernels.ARC_LENGTH] = arc
+        self._record[kernels.ARC_LENGTH] = arc
 
     def observe(
         self, state: ArrayLike, acceleration: float, steering_angle: float
@@ -50,24 +50,24 @@ class PathObserver:
 
         The foot point is searched near the last one, so on the local branch of the path.
         """
-        self._memory[:6] = state
-        self._memory[kernels.ACCELERATION] = acceleration
-        self._memory[kernels.STEERING] = steering_angle
+        self._record[:6] = state
+        self._record[kernels.ACCELERATION] = acceleration
+        self._record[kernels.STEERING] = steering_angle
         window = min(SEARCH_WINDOW, self.path.length)
-        kernels.look(self._memory, self._constants, self.path.table, self._observation, 0.0, window)
+        kernels.look(self._record, self._constants, self.path.table, self._observation, 0.0, window)
         return self._observation.copy()
 
     @property
     def arc_length(self) -> float:
         """Of the last foot point, m; on a closed path it runs on over laps."""
-        return float(self._memory[kernels.ARC_LENGTH])
+        return float(self._record[kernels.ARC_LENGTH])
 
     @property
     def lateral_error(self) -> float:
         """Of the last state, m, left positive."""
-        return float(self._memory[kernels.LATERAL_ERROR])
+        return float(self._record[kernels.LATERAL_ERROR])
 
     @property
     def heading_error(self) -> float:
         """Of the last state, rad."""
-        return float(self._memory[kernels.HEADING_ERROR])
+        return float(self._record[kernels.HEADING_ERROR])

@@ -197,7 +197,7 @@ class HighwayTrackEnv(PathTrackingEnv):
         path = scenes.path_of(self.scene, int(start.lane_index[2]), self.speed_limits)
         options.setdefault("arc_length", path.project(*start.position).arc_length)
         tracking, info = super().reset(seed=seed, options={**options, "trajectory": path})
-        self._memory[kernels.START] += (self.laps - 1) * path.length
+        self._record[kernels.START] += (self.laps - 1) * path.length
         self._reference = TrafficReference(path, self.vehicle, self.layout, self.cruise)
         self._take_table(self._reference.table)
         self._put_ego(start)
@@ -230,7 +230,7 @@ class HighwayTrackEnv(PathTrackingEnv):
 
     def _place(self) -> None:
         assert self._ego is not None
-        self._ego.place(self._memory[:6], float(self._memory[kernels.REFERENCE_SPEED]))
+        self._ego.place(self._record[:6], float(self._record[kernels.REFERENCE_SPEED]))
 
     @property
     def others(self) -> list[Any]:
@@ -239,7 +239,7 @@ class HighwayTrackEnv(PathTrackingEnv):
 
     def _look_ahead(self) -> None:
         """Find who is ahead, and lower the reference's speed to keep the gap."""
-        s, speed = float(self._memory[kernels.ARC_LENGTH]), float(self._memory[VX])
+        s, speed = float(self._record[kernels.ARC_LENGTH]), float(self._record[VX])
         self._reference.look(s, speed, self.others)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -259,7 +259,7 @@ class HighwayTrackEnv(PathTrackingEnv):
                 info["reward_terms"]["end"] += loss
                 reward += loss
             info["end"] = kernels.END_NAMES[kernels.COLLISION]
-            self._memory[kernels.END] = kernels.COLLISION
+            self._record[kernels.END] = kernels.COLLISION
             terminated, truncated, self._running = True, False, False
         self._look_ahead()
         return self._observation_of(tracking), reward, terminated, truncated, info | self._info()

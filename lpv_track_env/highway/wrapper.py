@@ -90,7 +90,7 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         )
         agent = agents.make("lpv-nmpc", env)
         observation, info = env.reset(seed=0)
-        action, memory = agent.predict(observation)
+        action, record = agent.predict(observation)
         observation, reward, terminated, truncated, info = env.step(action)
 
     The control period is one of the environment's policy; a `policy_frequency` of 10 or more gives
@@ -172,33 +172,33 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         task = Task(path, self.vehicle, self.control_period, self.layout, RewardWeights(),
                     max_lateral_error=1e6, time_limit=None)  # fmt: skip
         self._constants = task.constants()
-        self._memory = np.zeros(kernels.MEMORY_SIZE)
-        self._memory[kernels.ARC_LENGTH] = path.project(*start.position).arc_length
+        self._record = np.zeros(kernels.RECORD_SIZE)
+        self._record[kernels.ARC_LENGTH] = path.project(*start.position).arc_length
         self._observation = np.zeros(self.layout.size, dtype=np.float32)
 
     def _observe(self, ahead: float) -> NDArray[np.float32]:
         """Observe the vehicle, its foot point about `ahead` m from the last."""
-        car, memory = self.highway.vehicle, self._memory
+        car, record = self.highway.vehicle, self._record
         steering = float(car.action["steering"])
         slip = math.atan(0.5 * math.tan(steering))
-        memory[VX], memory[VY] = car.speed * math.cos(slip), car.speed * math.sin(slip)
-        memory[PSI], memory[YAW_RATE] = car.heading, car.speed * math.sin(slip) / (0.5 * car.LENGTH)
-        memory[X], memory[Y] = car.position
-        memory[kernels.ACCELERATION] = float(car.action["acceleration"])
-        memory[kernels.STEERING] = steering
+        record[VX], record[VY] = car.speed * math.cos(slip), car.speed * math.sin(slip)
+        record[PSI], record[YAW_RATE] = car.heading, car.speed * math.sin(slip) / (0.5 * car.LENGTH)
+        record[X], record[Y] = car.position
+        record[kernels.ACCELERATION] = float(car.action["acceleration"])
+        record[kernels.STEERING] = steering
         window = min(max(SEARCH_WINDOW, 1.5 * abs(ahead)), self.path.length)
         kernels.look(
-            memory, self._constants, self._reference.table, self._observation, ahead, window
+            record, self._constants, self._reference.table, self._observation, ahead, window
         )
         return self._observation.copy()
 
     def _look_ahead(self) -> None:
         road, car = self.highway.road, self.highway.vehicle
-        s = float(self._memory[kernels.ARC_LENGTH])
+        s = float(self._record[kernels.ARC_LENGTH])
         self._reference.look(s, float(car.speed), others_on(road, car))
 
     def _info(self) -> dict[str, Any]:
-        m = self._memory
+        m = self._record
         return {
             "lateral_error": float(m[kernels.LATERAL_ERROR]),
             "heading_error": float(m[kernels.HEADING_ERROR]),

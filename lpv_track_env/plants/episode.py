@@ -25,9 +25,9 @@ class PlantEpisode:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
 
-    def begin(self, memory: Array) -> None:
+    def begin(self, record: Array) -> None:
         """Take over the state and the steering angle that an episode begins with."""
-        self.plant.begin(memory[:6].copy(), float(memory[kernels.STEERING]))
+        self.plant.begin(record[:6].copy(), float(record[kernels.STEERING]))
 
     def advance(self, episode: Array, table: Array, *conditioned: Any) -> tuple[float, ...]:
         """Drive one control period in place: arguments and result as of `kernels.advance`.
@@ -38,8 +38,8 @@ class PlantEpisode:
         end = kernels.NOT_FINITE
         if math.isfinite(episode[0]) and math.isfinite(episode[1]):
             if conditioned:
-                memory, spec = conditioned[:2]
-                a, delta, bits = conditions_episode.command_under_conditions(episode, memory, spec)
+                vehicle, spec = conditioned[:2]
+                a, delta, bits = conditions_episode.command_under_conditions(episode, vehicle, spec)
             else:
                 a, delta, bits = kernels.command(episode)
             period = float(episode[kernels.CONSTANTS + kernels.PERIOD])
@@ -53,6 +53,6 @@ class PlantEpisode:
             else:
                 vx, vy, psi, r, x, y = state.tolist()
                 end = kernels.conclude(episode, table, vx, vy, psi, r, x, y, a, delta, bits)
-        told = episode[kernels.MEMORY : kernels.CONSTANTS].tolist()[kernels.ARC_LENGTH :]
+        told = episode[kernels.RECORD : kernels.CONSTANTS].tolist()[kernels.ARC_LENGTH :]
         clipped = kernels.CLIPPED - kernels.ARC_LENGTH
         return end, *told[:clipped], int(told[clipped]), *told[clipped + 1 :]

@@ -22,7 +22,7 @@ SHOWN = np.array(
         kernels.STEERING, kernels.ACCELERATION,
     ]
 )  # fmt: skip
-"""the memory's entries that they hold after the time."""
+"""the record's entries that they hold after the time."""
 
 
 class History:
@@ -36,19 +36,19 @@ class History:
         self._rows, self._count = np.zeros((2 * self._kept, 7)), 0
         self._trail: list[tuple[float, float]] = []
 
-    def add(self, memory: Array) -> bool:
-        """Take in an episode's memory; False if that control period is known already."""
-        if memory[kernels.STEPS] == self._steps:
+    def add(self, record: Array) -> bool:
+        """Take in an episode's record; False if that control period is known already."""
+        if record[kernels.STEPS] == self._steps:
             return False
-        self._steps = float(memory[kernels.STEPS])
+        self._steps = float(record[kernels.STEPS])
         if self._count == len(self._rows):
             self._rows[: self._kept] = self._rows[-self._kept :]
             self._count = self._kept
         row = self._rows[self._count]
         row[TIME] = self._steps * self._period
-        row[SPEED:] = memory[SHOWN]
+        row[SPEED:] = record[SHOWN]
         self._count += 1
-        place = (float(memory[X]), float(memory[Y]))
+        place = (float(record[X]), float(record[Y]))
         if not self._trail or math.dist(self._trail[-1], place) >= TRAIL_SPACING:
             self._trail.append(place)
         return True

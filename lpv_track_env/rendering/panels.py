@@ -61,7 +61,7 @@ class Cards:
         self._scale: tuple[int, pygame.Surface] | None = None
         self._title = f"{task.path.name} · {task.vehicle.name}"
 
-    def draw_task(self, surface: pygame.Surface, memory: Array, forces: AxleForces) -> int:
+    def draw_task(self, surface: pygame.Surface, record: Array, forces: AxleForces) -> int:
         """Draw what is driven, how far, and in which band; returns the card's lower end."""
         scale, left = SUPERSAMPLING, SUPERSAMPLING * (MARGIN + PADDING)
         surface.blit(self._blank, (scale * MARGIN, scale * MARGIN))
@@ -70,11 +70,11 @@ class Cards:
         surface.blit(title, (left, top))
         top += scale * (ROW + 4)
         self._row(
-            surface, top, "time", f"{memory[kernels.STEPS] * self._task.control_period:.2f} s"
+            surface, top, "time", f"{record[kernels.STEPS] * self._task.control_period:.2f} s"
         )
         top += scale * ROW
-        s, length = float(memory[kernels.ARC_LENGTH]), self._task.path.length
-        share = (s - float(memory[kernels.START]) * self._task.path.closed) / length
+        s, length = float(record[kernels.ARC_LENGTH]), self._task.path.length
+        share = (s - float(record[kernels.START]) * self._task.path.closed) / length
         self._row(surface, top, "driven", f"{s:.0f} of {length:.0f} m")
         self._bar(surface, top, min(max(share, 0.0), 1.0))
         top += scale * ROW

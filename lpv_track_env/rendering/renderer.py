@@ -5,7 +5,7 @@ time; closing it (or Escape) ends the drawing, not the run, and Space pauses. On
 display SDL draws unseen: that is warned of once, and nothing waits for real time. Only where SDL
 has no video driver at all is it a RuntimeError, of one line.
 
-A frame depends on nothing but the task, the memories seen since `begin` and what the agent showed:
+A frame depends on nothing but the task, the records seen since `begin` and what the agent showed:
 equal episodes give equal frames. Camera, trail and charts go by the episode's own time, so a run of
 which every tenth step is drawn shows the same as one that is drawn step by step.
 """
@@ -54,7 +54,7 @@ KEPT_TRACKS = 8
 
 
 class Renderer:
-    """Draws the memories of one environment's episodes.
+    """Draws the records of one environment's episodes.
 
     Parameters
     ----------
@@ -124,25 +124,25 @@ class Renderer:
         self._cards = Cards(task, self._letters)
         self._charts = Charts(signals_of(task), self._letters)
 
-    def follow(self, memory: Array) -> None:
+    def follow(self, record: Array) -> None:
         """Note what a control period brought, drawn or not; the same one again changes nothing."""
-        if self._history.add(memory):
-            time = float(memory[kernels.STEPS]) * self._task.control_period
-            vx, x, y = float(memory[VX]), float(memory[X]), float(memory[Y])
-            self._camera.follow(time, vx, x, y, float(memory[kernels.ARC_LENGTH]), self._task.path)
+        if self._history.add(record):
+            time = float(record[kernels.STEPS]) * self._task.control_period
+            vx, x, y = float(record[VX]), float(record[X]), float(record[Y])
+            self._camera.follow(time, vx, x, y, float(record[kernels.ARC_LENGTH]), self._task.path)
 
-    def draw(self, memory: Array) -> NDArray[np.uint8] | None:
-        """Draw an episode's memory, (`kernels.MEMORY_SIZE`,).
+    def draw(self, record: Array) -> NDArray[np.uint8] | None:
+        """Draw an episode's record, (`kernels.RECORD_SIZE`,).
 
         Returns
         -------
         NDArray | None
             The frame, (600, 900, 3) uint8, for "rgb_array"; None for "human".
         """
-        self.follow(memory)
+        self.follow(record)
         if self.render_mode == "human" and self._window.dismissed:
             return None
-        self._compose(memory)
+        self._compose(record)
         if self.render_mode == "human":
             self._window.show(self._frame)
             return None
@@ -153,8 +153,8 @@ class Renderer:
         """Close the window, if any; a later `draw` opens it again."""
         self._window.close()
 
-    def _compose(self, memory: Array) -> None:
-        place = np.array([memory[X], memory[Y]])
+    def _compose(self, record: Array) -> None:
+        place = np.array([record[X], record[Y]])
         view = self._camera.view(float(place[0]), float(place[1]))
         surface = self._large
         surface.set_clip((0, 0, WIDTH * SUPERSAMPLING, SCENE_HEIGHT * SUPERSAMPLING))
@@ -165,16 +165,16 @@ class Renderer:
         if self.others is not None:
             draw_others(surface, view, self.others)
         self._draw_trail(view, place)
-        self._vehicle.draw(surface, view, memory)
+        self._vehicle.draw(surface, view, record)
         forces = axle_forces(
-            float(memory[VX]), float(memory[VY]), float(memory[YAW_RATE]),
-            float(memory[kernels.STEERING]), self._task.vehicle,
+            float(record[VX]), float(record[VY]), float(record[YAW_RATE]),
+            float(record[kernels.STEERING]), self._task.vehicle,
         )  # fmt: skip
-        self._vehicle.draw_forces(surface, view, memory, forces)
+        self._vehicle.draw_forces(surface, view, record, forces)
         self._draw_plan(view)
-        lower = self._cards.draw_task(surface, memory, forces)
+        lower = self._cards.draw_task(surface, record, forces)
         self._cards.draw_notes(surface, self.notes, lower)
-        self._cards.draw_end(surface, int(memory[kernels.END]))
+        self._cards.draw_end(surface, int(record[kernels.END]))
         self._cards.draw_scale(surface, view)
         self._draw_map(place)
         self._draw_key()

@@ -75,10 +75,10 @@ class VehicleDrawing:
         self._half_track = side - 0.55 * WHEEL[1]
         self._reach = math.hypot(half, side) + abs(middle)
 
-    def draw(self, surface: pygame.Surface, view: View, memory: Array) -> None:
-        """Draw the vehicle as an episode's memory has it, its front wheels steered."""
-        car, psi = self._car, float(memory[PSI])
-        place = np.array([memory[X], memory[Y]])
+    def draw(self, surface: pygame.Surface, view: View, record: Array) -> None:
+        """Draw the vehicle as an episode's record has it, its front wheels steered."""
+        car, psi = self._car, float(record[PSI])
+        place = np.array([record[X], record[Y]])
 
         def fill(colour: tuple[int, int, int], points: Array) -> None:
             corners = view.pixels(turned(points, psi) + place).tolist()
@@ -91,7 +91,7 @@ class VehicleDrawing:
             fill(LAMP, lamp)
         for glass in self._glass:
             fill(GLASS, glass)
-        angles = ackermann(float(memory[kernels.STEERING]), car.wheelbase, 2.0 * self._half_track)
+        angles = ackermann(float(record[kernels.STEERING]), car.wheelbase, 2.0 * self._half_track)
         for axle, turns in (
             (car.front_axle_distance, angles),
             (-car.rear_axle_distance, (0.0, 0.0)),
@@ -103,12 +103,12 @@ class VehicleDrawing:
         pygame.draw.circle(surface, INK, view.pixels(place).tolist(), 2 * SUPERSAMPLING)
 
     def draw_forces(
-        self, surface: pygame.Surface, view: View, memory: Array, forces: AxleForces
+        self, surface: pygame.Surface, view: View, record: Array, forces: AxleForces
     ) -> None:
         """Draw the axles' lateral forces as arrows from their middles."""
-        car, psi = self._car, float(memory[PSI])
-        place = np.array([memory[X], memory[Y]])
-        steered = psi + float(memory[kernels.STEERING])
+        car, psi = self._car, float(record[PSI])
+        place = np.array([record[X], record[Y]])
+        steered = psi + float(record[kernels.STEERING])
         for axle, force, heading in (
             (car.front_axle_distance, forces.front, steered),
             (-car.rear_axle_distance, forces.rear, psi),

@@ -47,7 +47,7 @@ def busy(env: PathTrackingVectorEnv) -> bool:
     """Whether the controller of a single environment still computes an earlier action."""
     if (given := env.condition_arrays) is None:
         return False
-    now = env.memories[0, k.STEPS] * env.single.control_period
+    now = env.records[0, k.STEPS] * env.single.control_period
     return bool(given[0][0, layout.FREE_AT] > now + layout.INSTANT)
 
 
@@ -75,8 +75,8 @@ class InTurns:
             self.agents[i].reset()
 
     def drive(self, periods: int) -> Array:
-        """Memories after each period, (n, periods, MEMORY_SIZE); NaN where the episode is over."""
-        trace = np.full((len(self.envs), periods, k.MEMORY_SIZE), np.nan)
+        """Memories after each period, (n, periods, RECORD_SIZE); NaN where the episode is over."""
+        trace = np.full((len(self.envs), periods, k.RECORD_SIZE), np.nan)
         for i, (env, agent) in enumerate(zip(self.envs, self.agents, strict=True)):
             for period in range(periods):
                 if env.arrays.ends[0] != k.RUNNING:
@@ -92,17 +92,17 @@ class InTurns:
                     self.iterations[i] += told["iterations"]
                     self.fallbacks[i] = told["fallback"]
                 env.step(self.actions[i])
-                trace[i, period] = env.memories[0]
+                trace[i, period] = env.records[0]
         return trace
 
 
 def assert_same(loop: ClosedLoop, turns: InTurns) -> None:
     for i, env in enumerate(turns.envs):
-        np.testing.assert_array_equal(loop.envs.memories[i], env.memories[0])
+        np.testing.assert_array_equal(loop.envs.records[i], env.records[0])
         np.testing.assert_array_equal(loop.envs.arrays.observations[i], env.arrays.observations[0])
         assert loop.envs.arrays.ends[i] == env.arrays.ends[0]
 
 
 def traced(loop: ClosedLoop, periods: int, weights: Any = None, **more: Any) -> tuple[Tally, Array]:
-    trace = np.full((loop.envs.num_envs, periods, k.MEMORY_SIZE), np.nan)
+    trace = np.full((loop.envs.num_envs, periods, k.RECORD_SIZE), np.nan)
     return loop.drive(periods, weights, trace=trace, **more), trace

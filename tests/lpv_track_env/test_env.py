@@ -342,14 +342,14 @@ def test_info_holds_plain_python_values_and_the_state() -> None:
         assert type(clipped) is int
         assert {type(said[name]) for name in list(said)[:4]} == {float}
     assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
-    memory = env._memory
+    record = env._record
     for name in ("lateral_error", "heading_error", "speed_error", "arc_length", "clipped"):
-        assert info[name] == memory[getattr(kernels, name.upper())]
+        assert info[name] == record[getattr(kernels, name.upper())]
     assert info["clipped"] == kernels.RATE_STEERING
-    assert list(info["reward_terms"].values()) == memory[kernels.TERMS :][: len(TERMS)].tolist()
+    assert list(info["reward_terms"].values()) == record[kernels.TERMS :][: len(TERMS)].tolist()
     assert tuple(info["reward_terms"]) == TERMS
-    assert reward == memory[kernels.REWARD]
-    np.testing.assert_array_equal(info["state"], memory[:6])
+    assert reward == record[kernels.REWARD]
+    np.testing.assert_array_equal(info["state"], record[:6])
 
 
 @pytest.mark.parametrize("period", [0.02, 0.05, 0.1])
@@ -359,7 +359,7 @@ def test_rate_limits_are_exact(period: float) -> None:
     rolling = env.vehicle.rolling_deceleration
     for k in range(1, 4):
         *_, info = env.step(np.array([3.0, 0.5], dtype=np.float32))
-        a, delta = env._memory[[kernels.ACCELERATION, kernels.STEERING]]
+        a, delta = env._record[[kernels.ACCELERATION, kernels.STEERING]]
         assert a == pytest.approx(rolling + k * 5.0 * period, abs=1e-12)
         assert delta == pytest.approx(k * math.pi / 300 / 0.02 * period, abs=1e-12)
         assert info["clipped"] == kernels.RATE_ACCELERATION + kernels.RATE_STEERING
@@ -533,7 +533,7 @@ def test_state_that_is_no_longer_finite_terminates() -> None:
     env = make(trajectory="straight")
     env.reset(seed=0)
     # No action brings this about: the field's r vy must overflow.
-    env._memory[[1, 3]] = 1e200
+    env._record[[1, 3]] = 1e200
     before = env.state
     observation, reward, terminated, truncated, info = env.step(np.zeros(2, dtype=np.float32))
     assert (terminated, truncated, info["end"]) == (True, False, "non_finite")
@@ -872,7 +872,7 @@ def test_reward_terms_are_the_documented_formulas() -> None:
     while not terminated:
         action = np.array([1.0 + 0.2 * (info["arc_length"] % 1.0), 0.04], dtype=np.float32)
         _, reward, terminated, _, info = env.step(action)
-        new_a, new_delta = env._memory[[kernels.ACCELERATION, kernels.STEERING]]
+        new_a, new_delta = env._record[[kernels.ACCELERATION, kernels.STEERING]]
         reference = info["state"][0] - info["speed_error"]
         wanted = {
             "progress": 1.1 * (info["arc_length"] - before) / reference,

@@ -69,19 +69,19 @@ def test_a_draw_is_not_moved_by_another() -> None:
 
 def test_start_lies_at_the_errors_asked_for() -> None:
     env = PathTrackingEnv("circle")
-    memory, observation = np.full(kernels.MEMORY_SIZE, 7.0), np.zeros(48, np.float32)
+    record, observation = np.full(kernels.RECORD_SIZE, 7.0), np.zeros(48, np.float32)
     given = np.array([12.0, 0.5, -0.2, 1.5])
     episodes.begin(
-        memory, env.task.constants(), env.path.table, observation,
+        record, env.task.constants(), env.path.table, observation,
         np.uint64(0), 0, given,
     )  # fmt: skip
-    radius = math.hypot(memory[4], memory[5] - 30.0)
+    radius = math.hypot(record[4], record[5] - 30.0)
     # Left of a circle that turns left is inside.
     assert radius == pytest.approx(29.5, abs=1e-9)
-    assert memory[2] == pytest.approx(12.0 / 30.0 - 0.2, abs=1e-9)
-    assert memory[0] == pytest.approx(float(env.path.sample(12.0).speed) + 1.5)
-    assert memory[kernels.ARC_LENGTH] == pytest.approx(12.0, abs=1e-9)
-    assert memory[kernels.ACCELERATION] == env.vehicle.rolling_deceleration
-    assert memory[kernels.START] == memory[kernels.ARC_LENGTH]
-    assert memory[kernels.STEPS] == 0.0
-    assert not memory[[kernels.END, *range(kernels.CLIPPED, kernels.MEMORY_SIZE)]].any()
+    assert record[2] == pytest.approx(12.0 / 30.0 - 0.2, abs=1e-9)
+    assert record[0] == pytest.approx(float(env.path.sample(12.0).speed) + 1.5)
+    assert record[kernels.ARC_LENGTH] == pytest.approx(12.0, abs=1e-9)
+    assert record[kernels.ACCELERATION] == env.vehicle.rolling_deceleration
+    assert record[kernels.START] == record[kernels.ARC_LENGTH]
+    assert record[kernels.STEPS] == 0.0
+    assert not record[[kernels.END, *range(kernels.CLIPPED, kernels.RECORD_SIZE)]].any()

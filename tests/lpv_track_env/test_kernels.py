@@ -118,8 +118,8 @@ def constants(**changes: float) -> np.ndarray:
     return values
 
 
-def memory(**changes: float) -> np.ndarray:
-    values = np.zeros(kernels.MEMORY_SIZE)
+def record(**changes: float) -> np.ndarray:
+    values = np.zeros(kernels.RECORD_SIZE)
     for name, value in changes.items():
         values[getattr(kernels, name)] = value
     return values
@@ -148,9 +148,9 @@ def memory(**changes: float) -> np.ndarray:
     ],
 )
 def test_judgement(changes: dict[str, float], closed: float, wanted: str) -> None:
-    code = kernels.judge(memory(**changes), constants(CLOSED=closed), True)
+    code = kernels.judge(record(**changes), constants(CLOSED=closed), True)
     assert kernels.END_NAMES[code] == wanted
-    assert kernels.END_NAMES[kernels.judge(memory(**changes), constants(), False)] == "non_finite"
+    assert kernels.END_NAMES[kernels.judge(record(**changes), constants(), False)] == "non_finite"
 
 
 def test_layout_of_memory_and_constants() -> None:
@@ -191,4 +191,4 @@ def test_layout_of_memory_and_constants() -> None:
     # Of a circle of 30 m: the chords' turn over their length comes a little above 1 / R.
     assert packed[kernels.TIGHTEST] == pytest.approx(1.0 / 30.0, rel=1e-4)
     np.testing.assert_array_equal(packed[kernels.WEIGHTS :], weights.as_array())
-    assert kernels.TERMS + len(TERMS) == kernels.MEMORY_SIZE
+    assert kernels.TERMS + len(TERMS) == kernels.RECORD_SIZE

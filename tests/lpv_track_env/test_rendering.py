@@ -86,7 +86,7 @@ def test_a_frame_is_a_picture(trajectory: str, vehicle: str) -> None:
     assert 200.0 < frame.mean() < 250.0
     assert len(np.unique(frame.astype(np.uint32) @ np.uint32([65536, 256, 1]))) > 50
     assert count(scene(frame), style.BODY) > 300
-    assert count(charts(frame), style.TRACE) > 0 or env._memory[kernels.STEPS] == 0
+    assert count(charts(frame), style.TRACE) > 0 or env._record[kernels.STEPS] == 0
 
 
 def test_frames_change_over_time() -> None:
@@ -172,10 +172,10 @@ def test_steered_wheels_and_forces_are_drawn() -> None:
     env.reset(seed=0)
     renderer = Renderer("rgb_array", 20)
     renderer.begin(env.task)
-    memory = env._memory.copy()
-    straight = renderer.draw(memory)
-    memory[kernels.STEERING] = 0.4
-    steered = renderer.draw(memory)
+    record = env._record.copy()
+    straight = renderer.draw(record)
+    record[kernels.STEERING] = 0.4
+    steered = renderer.draw(record)
     assert straight is not None
     assert steered is not None
     assert count(scene(straight), style.FORCE) == count(scene(steered), style.FORCE) - (
@@ -274,14 +274,14 @@ def test_frames_of_odd_episodes() -> None:
         {0: 80.0, 1: 40.0, 3: -20.0, kernels.ARC_LENGTH: 1e4},
     ):
         renderer.begin(env.task)
-        memory = env._memory.copy()
+        record = env._record.copy()
         for entry, value in changes.items():
-            memory[entry] = value
-        frame = renderer.draw(memory)
+            record[entry] = value
+        frame = renderer.draw(record)
         assert frame is not None
         assert 100.0 < frame.mean() < 255.0
-        memory[kernels.STEPS] += 400.0
-        again = renderer.draw(memory)
+        record[kernels.STEPS] += 400.0
+        again = renderer.draw(record)
         assert again is not None
 
 
@@ -477,7 +477,7 @@ def drawn(scenery: Scenery | None = None, others: NDArray[np.float64] | None = N
     renderer = Renderer("rgb_array", 20)
     renderer.begin(env.task, scenery)
     renderer.others = others
-    frame = renderer.draw(env._memory)
+    frame = renderer.draw(env._record)
     assert frame is not None
     return frame
 

@@ -128,8 +128,8 @@ def test_states_that_are_no_longer_finite(mode: AutoresetMode) -> None:
     ours.reset(seed=0)
     theirs.reset(seed=0)
     # No action brings this about: the field's r vy must overflow.
-    ours._memories[2, [1, 3]] = 1e200
-    theirs.envs[2].unwrapped._memory[[1, 3]] = 1e200
+    ours._records[2, [1, 3]] = 1e200
+    theirs.envs[2].unwrapped._record[[1, 3]] = 1e200
     *_, infos = step_both(ours, theirs, actions(5, 1)[0], mode)
     assert infos.get("final_info", infos)["end"][2] == "non_finite"
     for action in actions(5, 5):

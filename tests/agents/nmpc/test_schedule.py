@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from agents.nmpc.schedule import NO_BAND, WEIGHTS, Switching
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
-from lpv_track_env.kernels import PREVIEW_START
+from lpv_track_env.observation import PREVIEW_START
 from trajectories import CurvatureBands
 
 STEPS = 5

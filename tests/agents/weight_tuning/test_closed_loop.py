@@ -120,7 +120,7 @@ def test_drive_and_predict_share_one_memory() -> None:
         assert memory is mixed.memory.nmpc
         mixed.envs.step(actions)
     mixed.drive(4)
-    np.testing.assert_array_equal(mixed.envs.memories, whole.envs.memories)
+    np.testing.assert_array_equal(mixed.envs.records, whole.envs.records)
 
 
 def test_environments_are_the_same_in_any_number() -> None:
@@ -304,7 +304,7 @@ def test_tally_is_the_sums_over_the_trace() -> None:
     loop, turns = loop_of(9, settings, model=quick), InTurns(9, settings, None, model=quick)
     loop.reset(seed=8)
     turns.reset(seed=8)
-    before = loop.envs.memories.copy()
+    before = loop.envs.records.copy()
     tally, trace = traced(loop, 25)
     turns.drive(25)
     for i in range(9):

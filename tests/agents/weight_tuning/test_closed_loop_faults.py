@@ -110,14 +110,14 @@ def test_impossible_threads_are_refused(threads: int) -> None:
 def test_bad_weights_are_refused_and_nothing_moves(weights: Any, message: str) -> None:
     loop = loop_of(3, CALM)
     loop.reset(seed=0)
-    before = loop.envs.memories.copy()
+    before = loop.envs.records.copy()
     with pytest.raises(ValueError, match=message):
         loop.drive(5, weights)
-    np.testing.assert_array_equal(loop.envs.memories, before)
+    np.testing.assert_array_equal(loop.envs.records, before)
 
 
 def read_only() -> np.ndarray:
-    array = np.zeros((3, 5, k.MEMORY_SIZE))
+    array = np.zeros((3, 5, k.RECORD_SIZE))
     array.flags.writeable = False
     return array
 
@@ -125,12 +125,12 @@ def read_only() -> np.ndarray:
 @pytest.mark.parametrize(
     "trace",
     [
-        np.zeros((3, 4, k.MEMORY_SIZE)),
-        np.zeros((2, 5, k.MEMORY_SIZE)),
+        np.zeros((3, 4, k.RECORD_SIZE)),
+        np.zeros((2, 5, k.RECORD_SIZE)),
         np.zeros((3, 5)),
         np.zeros((3, 5, 6)),
-        np.zeros((3, 5, k.MEMORY_SIZE), dtype=np.float32),
-        np.zeros((k.MEMORY_SIZE, 5, 3)).T,
+        np.zeros((3, 5, k.RECORD_SIZE), dtype=np.float32),
+        np.zeros((k.RECORD_SIZE, 5, 3)).T,
         read_only(),
     ],
 )

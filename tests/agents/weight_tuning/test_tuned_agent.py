@@ -144,7 +144,7 @@ def test_a_batch_whose_rows_begin_and_fail_on_their_own_is_the_compiled_loop() -
         loop.drive(1)
         actions, memory = agent.predict(envs.arrays.observations.copy(), memory, starts)
         envs.step(actions)
-        np.testing.assert_array_equal(envs.memories, loop.envs.memories)
+        np.testing.assert_array_equal(envs.records, loop.envs.records)
         starts = np.arange(4) == period % 9
         options = {"reset_mask": starts}
         if starts.any():

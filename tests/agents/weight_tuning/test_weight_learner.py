@@ -251,5 +251,5 @@ def test_a_network_that_makes_no_number_leaves_the_base() -> None:
         loop.reset(seed=1)
         loop.drive(40)
         loops.append(loop)
-    np.testing.assert_array_equal(loops[0].envs.memories, loops[1].envs.memories)
+    np.testing.assert_array_equal(loops[0].envs.records, loops[1].envs.records)
     assert (loops[0].memory.watched[:, REJECTED] >= 5).all()

@@ -26,7 +26,7 @@ def test_same_episodes(settings: dict[str, Any]) -> None:
         **settings,
     )  # fmt: skip
     env.reset(seed=0)
-    yardstick = NumpyTracking(env.tasks[0], env.memories)
+    yardstick = NumpyTracking(env.tasks[0], env.records)
     rng = np.random.default_rng(0)
     running = np.ones(n, dtype=bool)
     ends = 0

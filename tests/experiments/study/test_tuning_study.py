@@ -90,7 +90,7 @@ def test_a_band_s_score_is_of_its_periods_alone() -> None:
     path = trajectories.load("figure-eight")
     places = np.linspace(0.0, path.length, 400, endpoint=False)
     bands = CurvatureBands().classify(path.sample(places).curvature)
-    trace = np.zeros((1, 401, kernels.MEMORY_SIZE))
+    trace = np.zeros((1, 401, kernels.RECORD_SIZE))
     trace[0, 1:, kernels.ARC_LENGTH] = places
     trace[0, 1:, kernels.LATERAL_ERROR] = 0.05 * (1.0 + bands)
     trace[0, 300:] = np.nan

@@ -85,7 +85,7 @@ def test_draws_are_uniform_over_the_ranges_and_differ_between_episodes() -> None
     for seed in range(400):
         env.reset(seed=seed)
         assert env._conditioned is not None
-        drawn.append(env._conditioned.memory[: len(DRAWN)].copy())
+        drawn.append(env._conditioned.vehicle[: len(DRAWN)].copy())
     values = np.array(drawn)
     ranges = REALTIME.ranges()
     np.testing.assert_array_equal(values.min(axis=0) >= ranges[:, 0], True)
@@ -98,11 +98,11 @@ def test_draws_are_uniform_over_the_ranges_and_differ_between_episodes() -> None
     correlation = np.corrcoef(shares.T) - np.eye(spread.sum())
     assert np.abs(correlation).max() < 4.5 / math.sqrt(400)
     env.reset(seed=5)
-    first = env._conditioned.memory[: len(DRAWN)].copy()
+    first = env._conditioned.vehicle[: len(DRAWN)].copy()
     env.reset()
-    assert (env._conditioned.memory[: len(DRAWN)] != first)[spread].all()
+    assert (env._conditioned.vehicle[: len(DRAWN)] != first)[spread].all()
     env.reset(seed=5)
-    np.testing.assert_array_equal(env._conditioned.memory[: len(DRAWN)], first)
+    np.testing.assert_array_equal(env._conditioned.vehicle[: len(DRAWN)], first)
 
 
 def test_memory_indices_follow_the_fields() -> None:

@@ -174,7 +174,7 @@ def test_side_wind_pushes_by_its_force() -> None:
     """First period of a straight drive: lateral and yaw acceleration by the air's force."""
     env = straight(wind_speed=8.0)
     assert env._conditioned is not None
-    wind = 8.0 * env._conditioned.memory[[conditions_layout.WIND_X, conditions_layout.WIND_Y]]
+    wind = 8.0 * env._conditioned.vehicle[[conditions_layout.WIND_X, conditions_layout.WIND_Y]]
     ahead, aside = wind - [10.0, 0.0]
     force = 0.5 * AIR_DENSITY * 12.0 * math.hypot(ahead, aside) * aside
     # Within 0.1 ms neither tyres nor heading have answered.
@@ -440,7 +440,7 @@ def test_computing_times_need_conditions() -> None:
 
 def test_a_vehicle_gone_mad_ends_as_non_finite() -> None:
     env = straight(estimator="ekf")
-    env._memory[VY] = 1e308
+    env._record[VY] = 1e308
     *_, terminated, _, info = env.step(np.array([0.0, 0.3]))
     assert terminated
     assert info["end"] in {"non_finite", "left_corridor"}
