@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from experiments.agent_words import agent_notes, world_plan
 from experiments.highway.drives import TrafficDrive
 from experiments.run.case import Case
-from experiments.run.interrupts import Interrupts
+from experiments.run.process import Interrupts
 from experiments.run.rollout import Rollout, steps
 from experiments.sinks import PngSink, Sink, VideoSink, WindowSink
 

@@ -17,7 +17,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from experiments.options import parser
+from experiments.cli import parser
 from experiments.report.errata import ERRATA
 
 with warnings.catch_warnings():

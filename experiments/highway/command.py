@@ -10,8 +10,9 @@ from rich.console import Console
 from rich.table import Table
 
 from agents.registry import check_settings
+from experiments.commands.options import parse_settings
 from experiments.highway.drives import OWN, TrafficDrive, run_drive
-from experiments.run.benchmark import parse_settings, progress_bar
+from experiments.run.benchmark import progress_bar
 from experiments.run.engines import local_pool
 from experiments.run.statistics import rate_interval
 from experiments.run.store import ResultStore

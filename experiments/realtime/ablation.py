@@ -10,7 +10,7 @@ from rich.table import Table
 
 from experiments.figures import COLOURS, plain_ticks, save_figure
 from experiments.run.benchmark import run_benchmark, selected, tell_failed
-from experiments.run.store import revision, versions
+from experiments.run.provenance import revision, versions
 from experiments.run.suites import grid
 from experiments.run.tables import estimate
 from lpv_track_env.conditions import REALTIME

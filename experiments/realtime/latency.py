@@ -23,8 +23,8 @@ from experiments.figures import COLOURS, plain_ticks, save_figure
 from experiments.run.benchmark import run_benchmark, selected, tell_failed
 from experiments.run.case import Case
 from experiments.run.computing import ARRANGEMENTS, ComputingTimes, quantiles
+from experiments.run.provenance import revision, versions
 from experiments.run.rollout import rollout
-from experiments.run.store import revision, versions
 from experiments.run.suites import grid
 from experiments.run.tables import estimate
 from lpv_track_env.estimation.estimator import Estimator

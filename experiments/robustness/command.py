@@ -16,7 +16,7 @@ from experiments.robustness.summary import summary, table, widest_kept
 from experiments.robustness.switching import BATCH, WHOLE, WINDOW, Setup, arms_of, drive_arm
 from experiments.run.benchmark import progress_bar
 from experiments.run.case import project_digest
-from experiments.run.store import hardware, revision, versions
+from experiments.run.provenance import hardware, revision, versions
 from lpv_track_env import conditions
 from lpv_track_env.threads import checked_threads
 from trajectories.atomic import write_atomically

@@ -52,9 +52,9 @@ def _datum(options: argparse.Namespace) -> Datum | None:
 
 
 def _export(options: argparse.Namespace, console: Console) -> int:
-    from experiments.run.benchmark import parse_settings
+    from experiments.commands.options import parse_settings
     from experiments.run.case import Case
-    from experiments.run.interrupts import Interrupts
+    from experiments.run.process import Interrupts
     from experiments.run.rollout import rollout
 
     # All that can be refused is refused before the drive.
@@ -165,11 +165,11 @@ def _replay(options: argparse.Namespace, console: Console) -> int:
     import agents
     import trajectories
     from agents.registry import check_settings
+    from experiments.commands.options import parse_settings
     from experiments.ros.arguments import TOPIC_KINDS
     from experiments.ros.comparison import draw, summary, table
     from experiments.ros.recording import record
     from experiments.ros.replay import replay
-    from experiments.run.benchmark import parse_settings
     from lpv_track_env import vehicle
     from lpv_track_env.estimation.observer import PathObserver
     from trajectories.atomic import write_atomically

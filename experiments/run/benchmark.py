@@ -1,10 +1,9 @@
 """`lpv-track benchmark`: run cases, keep them, print the table, write the report."""
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -21,7 +20,7 @@ from experiments.report.build import where, write_report
 from experiments.run import engines
 from experiments.run.case import Case
 from experiments.run.console_tables import console_table
-from experiments.run.interrupts import Interrupts
+from experiments.run.process import Interrupts
 from experiments.run.store import ResultStore
 
 Spec = Mapping[str, Any]
@@ -150,29 +149,3 @@ def tell_failed(cases: Sequence[Mapping[str, Any]], console: Console) -> int:
     for case in failed:
         console.print(f"failed: {label(case)}: {case['error']}", markup=False, style="red")
     return len(failed)
-
-
-def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
-    """Read KEY=VALUE pairs; values are JSON where they parse as such, text otherwise.
-
-    Raises
-    ------
-    ValueError
-        For a pair without "=", or a number that is not finite.
-    """
-
-    def refuse(constant: str) -> NoReturn:
-        raise OverflowError(constant)
-
-    settings: dict[str, Any] = {}
-    for pair in pairs:
-        key, separator, value = pair.partition("=")
-        if not separator or not key:
-            raise ValueError(f"{pair!r} is not KEY=VALUE")
-        try:
-            settings[key] = json.loads(value, parse_constant=refuse)
-        except OverflowError:
-            raise ValueError(f"{pair}: numbers must be finite") from None
-        except ValueError:
-            settings[key] = value
-    return settings

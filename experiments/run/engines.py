@@ -15,18 +15,11 @@ from multiprocessing.connection import wait as wait_for
 from typing import Any
 
 from experiments.run.case import Case, run_case
+from experiments.run.process import one_thread
 
 Result = dict[str, Any]
 Spec = Mapping[str, Any]
 Run = Callable[[Spec], Result]
-
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-def one_thread() -> None:
-    """One thread a process, for this one's children too; before numerical libraries load."""
-    for variable in THREAD_VARIABLES:
-        os.environ.setdefault(variable, "1")
 
 
 def in_process(

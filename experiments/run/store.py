@@ -5,12 +5,9 @@ A run that was killed resumes: a torn last line is dropped, of several lines wit
 counts, and files are replaced atomically.
 """
 
-import importlib.metadata
 import io
 import json
 import os
-import platform
-import subprocess
 import sys
 import zipfile
 import zlib
@@ -22,13 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.run.provenance import provenance
 from trajectories.atomic import write_atomically
-
-PACKAGES = ("lpv-track-env", "numpy", "scipy", "numba", "casadi", "gymnasium")
-OPTIONAL_PACKAGES = (
-    "torch", "stable-baselines3", "highway-env", "cma", "piqp", "rosbags",
-    "commonroad-vehicle-models",
-)  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -117,9 +109,7 @@ class ResultStore:
             "written": datetime.now(UTC).isoformat(timespec="seconds"),
             "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
             "settings": dict(settings),
-            "revision": revision(),
-            "versions": versions(),
-            "hardware": hardware(),
+            **provenance(),
         }
         content = json.dumps(manifest, indent=2, sort_keys=True).encode()
         write_atomically(self.folder / "manifest.json", content)
@@ -132,52 +122,3 @@ class ResultStore:
         except (OSError, ValueError):
             return {}
         return content
-
-
-def revision() -> dict[str, Any]:
-    """Git revision of the sources, and whether they differ from it; None outside a checkout."""
-    here = Path(__file__).parent
-
-    def git(*arguments: str) -> str | None:
-        try:
-            done = subprocess.run(  # noqa: S603  fixed arguments
-                ["git", "-C", str(here), *arguments],  # noqa: S607
-                capture_output=True, text=True, timeout=10, check=False,
-            )  # fmt: skip
-        except (OSError, subprocess.TimeoutExpired):
-            return None
-        return done.stdout.strip() if done.returncode == 0 else None
-
-    commit, changes = git("rev-parse", "HEAD"), git("status", "--porcelain", "--untracked-files=no")
-    return {"commit": commit, "modified": None if changes is None else bool(changes)}
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and the packages that results depend on."""
-    found = {"python": platform.python_version()}
-    for package in (*PACKAGES, *OPTIONAL_PACKAGES):
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return found
-
-
-def hardware() -> dict[str, Any]:
-    """Processor, cores, memory (GiB) and system."""
-    processor = platform.processor() or platform.machine()
-    memory = None
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-        processor = names[0] if names else processor
-        pages, size = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
-        memory = round(pages * size / 2**30, 1)
-    except (OSError, ValueError):
-        pass
-    return {
-        "processor": processor,
-        "cores": os.cpu_count(),
-        "memory_gib": memory,
-        "system": platform.system(),
-    }

@@ -22,8 +22,8 @@ from rich.progress import (
 )
 
 from experiments.figures import save_figure
-from experiments.run.interrupts import Interrupts
-from experiments.run.store import hardware, revision, versions
+from experiments.run.process import Interrupts
+from experiments.run.provenance import hardware, revision, versions
 from experiments.speed import (
     environments,
     learning,

@@ -11,8 +11,8 @@ from experiments.report.html_tables import html_table
 from experiments.report.page import render_page
 from experiments.report.styles import legend, line_styles
 from experiments.run.band_metrics import BANDS
+from experiments.run.provenance import hardware, revision, versions
 from experiments.run.statistics import Interval
-from experiments.run.store import hardware, revision, versions
 from experiments.study import figures, tables
 from experiments.study.ladder import BASELINE, OURS, PPO
 from experiments.study.oracle import Headroom

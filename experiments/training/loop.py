@@ -13,8 +13,8 @@ from stable_baselines3.common.logger import Logger, configure
 
 from agents.learned.files import read as read_policy
 from agents.learned.files import write as write_policy
-from experiments.run.interrupts import Interrupts
-from experiments.run.store import hardware, revision, versions
+from experiments.run.process import Interrupts
+from experiments.run.provenance import hardware, revision, versions
 from experiments.training import checkpoint
 from experiments.training.cloning import CloningTrainer
 from experiments.training.environments import load_paths, make_learner_env

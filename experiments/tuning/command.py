@@ -10,7 +10,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from experiments.run.benchmark import parse_settings, progress_bar
+from experiments.commands.options import parse_settings
+from experiments.run.benchmark import progress_bar
 from experiments.tuning.settings import PPO_METHODS, TuningSettings, usual
 
 PLAIN = (

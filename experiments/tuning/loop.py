@@ -9,8 +9,8 @@ from typing import Any
 
 from agents.weight_tuning.files import write as write_policy
 from agents.weights import TrackingWeights, WeightSchedule
-from experiments.run.interrupts import Interrupts
-from experiments.run.store import hardware, revision, versions
+from experiments.run.process import Interrupts
+from experiments.run.provenance import hardware, revision, versions
 from experiments.training.lock import alone_in
 from experiments.tuning.drives import load_paths, path_names
 from experiments.tuning.settings import PPO_METHODS, TuningSettings

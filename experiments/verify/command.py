@@ -19,7 +19,7 @@ from rich.table import Table
 from agents.registry import agent_class
 from experiments.run import engines
 from experiments.run.benchmark import progress_bar
-from experiments.run.store import hardware, revision, versions
+from experiments.run.provenance import hardware, revision, versions
 from experiments.run.suites import PAPER_VEHICLES
 from experiments.verify.bench import FATROP_EVERY, run_situation, situation_death
 from experiments.verify.situations import kind

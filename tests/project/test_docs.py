@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from experiments import cli
-from experiments.options import parser
+from experiments.cli import parser
 from experiments.report.errata import ERRATA
 
 ROOT = Path(__file__).parents[2]

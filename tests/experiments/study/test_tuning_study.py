@@ -18,7 +18,7 @@ from agents.weight_tuning.files import load
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import FAILED, PARTS
 from agents.weights import TrackingWeights, WeightSchedule
-from experiments.options import parser
+from experiments.cli import parser
 from experiments.run.case import Case, run_case
 from experiments.run.metrics import evaluate
 from experiments.run.rollout import rollout

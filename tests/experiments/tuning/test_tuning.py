@@ -28,7 +28,7 @@ from agents.weight_tuning.files import load
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments import cli
-from experiments.run.store import revision, versions
+from experiments.run.provenance import revision, versions
 from experiments.tuning import options
 from experiments.tuning.drives import TuningDrives, load_paths, path_names, weights_at
 from experiments.tuning.settings import HYPERPARAMETERS, LEARNED, METHODS, TuningSettings, usual

@@ -1,16 +1,25 @@
-"""Ctrl-C that is not lost."""
+"""Settings of the process itself: one thread for numerical libraries, no lost Ctrl-C."""
 
+import os
 import signal
 import threading
 from types import FrameType
 from typing import Any
 
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def one_thread() -> None:
+    """Give numerical libraries one thread, here and in child processes; call before they load."""
+    for variable in THREAD_VARIABLES:
+        os.environ.setdefault(variable, "1")
+
 
 class Interrupts:
-    """Ctrl-C, remembered: raised as ever, but also where what runs takes it for something else.
+    """Context that remembers Ctrl-C, for code that may swallow the KeyboardInterrupt.
 
-    CasADi takes one that comes during a solve for a failed solve, and Python drops one that comes
-    while a destructor runs. `check` raises it again.
+    CasADi takes a Ctrl-C during a solve for a failed solve, and Python drops one that comes while
+    a destructor runs. KeyboardInterrupt is raised as usual, and `check` raises it again.
     """
 
     def __init__(self) -> None:
@@ -31,6 +40,6 @@ class Interrupts:
         raise KeyboardInterrupt
 
     def check(self) -> None:
-        """Raise KeyboardInterrupt if it has come."""
+        """Raise KeyboardInterrupt if Ctrl-C was pressed inside the context."""
         if self._came:
             raise KeyboardInterrupt

@@ -1,0 +1,109 @@
+"""`lpv-track benchmark`: agents x trajectories x seeds, the paper's table, and a report."""
+
+import argparse
+from typing import Any
+
+from rich.console import Console
+
+from experiments.commands.options import (
+    add_conditions,
+    add_out,
+    add_seeds,
+    add_settings,
+    add_workers,
+    conditions_of,
+    parse_settings,
+    resumable,
+    seeds_of,
+)
+
+EXAMPLE = "lpv-track benchmark --agents stanley lqr --trajectories T1 T2 --out results/mine"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument(
+        "--suite",
+        default="paper",
+        help="paper (default), quick, realtime, learned, plants, converged, sideslip or frozen",
+    )
+    parser.add_argument(
+        "--agents",
+        nargs="+",
+        metavar="NAME",
+        help="default: all; your own: file.py:Class, policy.json",
+    )
+    parser.add_argument(
+        "--trajectories", nargs="+", metavar="NAME", help="instead of a suite's: names or files"
+    )
+    parser.add_argument("--vehicles", nargs="+", metavar="NAME", help="presets or .json files")
+    parser.add_argument("--speed-modes", nargs="+", choices=["variable", "fixed"])
+    add_conditions(
+        parser,
+        None,
+        "simulation (default), realtime or ideal",
+        "fields to change, e.g. gnss_noise=0.3 computing_delay=[0.01,0.05]",
+    )
+    add_seeds(parser, 1, "seeds 0..N-1 (default 1)")
+    parser.add_argument("--control-period", type=float, metavar="S", help="s (default 0.05)")
+    add_settings(parser, "--env", "environment settings, e.g. initial_error_range=[0.3,0.1,0.5]")
+    add_settings(parser, "--agent-set", "settings of every agent")
+    add_settings(
+        parser, "--vehicle-set", "vehicle fields to change, e.g. max_lateral_velocity_ratio=0.5"
+    )
+    add_out(parser, "results/benchmark")
+    add_workers(parser)
+    parser.add_argument(
+        "--resume", action="store_true", help="keep the cases that DIR holds already"
+    )
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the cases, print the tables, write the report; return 1 if a case failed, else 0."""
+    from experiments.run import suites
+    from experiments.run.benchmark import distinct, finish, run_benchmark
+    from trajectories.naming import choose
+
+    seeds = seeds_of(options)
+    names = options.agents or suites.default_agents()
+    if options.trajectories or options.vehicles or options.speed_modes:
+        specs = suites.grid(
+            names,
+            options.trajectories or suites.SIX,
+            vehicles=options.vehicles or ("m2-minibus",),
+            speed_modes=options.speed_modes or ("variable",),
+            seeds=seeds,
+        )
+        suite = "custom"
+    else:
+        suite = choose("suite", options.suite, tuple(suites.SUITES))
+        specs = suites.SUITES[suite](names, list(seeds))
+    common = {
+        "env_settings": parse_settings(options.env),
+        "agent_settings": parse_settings(options.agent_set),
+        "vehicle_changes": parse_settings(options.vehicle_set),
+    }
+    if options.control_period is not None:
+        common["control_period"] = options.control_period
+    if options.conditions is not None or options.conditions_set:
+        specs = [{**spec, "conditions": conditions_of(options)} for spec in specs]
+    specs = distinct([merged(spec, common) for spec in specs])
+    settings = {"suite": suite, "agents": names, "seeds": list(seeds), **common}
+    with resumable(options, console, "the same command with --resume"):
+        store = run_benchmark(
+            specs, options.out, workers=options.workers, settings=settings,
+            resume=options.resume, console=console,
+        )  # fmt: skip
+    return finish(store, specs, console)
+
+
+def merged(spec: dict[str, object], changes: dict[str, Any]) -> dict[str, object]:
+    """Return a spec with changes: mappings are merged, other values replaced."""
+    result = dict(spec)
+    for key, value in changes.items():
+        own = result.get(key)
+        if isinstance(value, dict):
+            result[key] = {**(own if isinstance(own, dict) else {}), **value}
+        else:
+            result[key] = value
+    return result

@@ -1,0 +1,74 @@
+"""What a written result carries to be reproduced: revision, versions, hardware, digests."""
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+PACKAGES = (
+    "lpv-track-env", "numpy", "scipy", "numba", "casadi", "gymnasium", "torch",
+    "stable-baselines3", "highway-env", "cma", "piqp", "rosbags", "commonroad-vehicle-models",
+)  # fmt: skip
+"""Packages that results depend on; the optional ones are listed where they are installed."""
+
+
+def provenance() -> dict[str, Any]:
+    """Return `revision`, `versions` and `hardware`, the entries of every written result."""
+    return {"revision": revision(), "versions": versions(), "hardware": hardware()}
+
+
+def revision() -> dict[str, Any]:
+    """Return the sources' Git `commit` and whether they are `modified`; None outside a checkout."""
+    here = Path(__file__).parent
+
+    def git(*arguments: str) -> str | None:
+        try:
+            done = subprocess.run(  # noqa: S603  fixed arguments
+                ["git", "-C", str(here), *arguments],  # noqa: S607
+                capture_output=True, text=True, timeout=10, check=False,
+            )  # fmt: skip
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    commit, changes = git("rev-parse", "HEAD"), git("status", "--porcelain", "--untracked-files=no")
+    return {"commit": commit, "modified": None if changes is None else bool(changes)}
+
+
+def versions(*further: str) -> dict[str, str]:
+    """Return the versions of Python, of `PACKAGES` and of `further` packages, if installed."""
+    found = {"python": platform.python_version()}
+    for package in (*PACKAGES, *further):
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def hardware() -> dict[str, Any]:
+    """Return processor, cores, memory (GiB) and operating system."""
+    processor = platform.processor() or platform.machine()
+    memory = None
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+        processor = names[0] if names else processor
+        pages, size = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
+        memory = round(pages * size / 2**30, 1)
+    except (OSError, ValueError):
+        pass
+    return {
+        "processor": processor,
+        "cores": os.cpu_count(),
+        "memory_gib": memory,
+        "system": platform.system(),
+    }
+
+
+def file_digest(file: Path) -> str:
+    """Return the SHA-256 of a file's content in hexadecimal."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
