@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trajectories import CurvatureBands, ReferencePath
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 Array = NDArray[np.float64]
 

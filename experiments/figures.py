@@ -4,7 +4,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from experiments.video import Video
 from lpv_track_env.rendering.window import Window
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 Frame = NDArray[np.uint8]
 

@@ -15,9 +15,8 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from trajectories.atomic import write_atomically
-from trajectories.columns import COLUMNS, Table, read_table, read_text
 from trajectories.curvature import circle_curvature, signed_waypoint_curvature, statistics
+from trajectories.fileio import COLUMNS, TextTable, read_table, read_text, write_atomically
 from trajectories.importers import read_gps, read_racetrack, read_xy
 from trajectories.path import ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
@@ -149,9 +148,9 @@ def read_native(
     return path
 
 
-def _split(file: Path) -> tuple[dict[str, Any], Table]:
+def _split(file: Path) -> tuple[dict[str, Any], TextTable]:
     """Metadata and table of a native file that is whole."""
-    table = Table(file, HEADER, [], [])
+    table = TextTable(file, HEADER, [], [])
     lines = read_text(file).split("\n")
     metadata = _metadata(lines, table)
     first = len(metadata)
@@ -174,7 +173,7 @@ def _split(file: Path) -> tuple[dict[str, Any], Table]:
     return metadata, table
 
 
-def _metadata(lines: list[str], table: Table) -> dict[str, Any]:
+def _metadata(lines: list[str], table: TextTable) -> dict[str, Any]:
     """Values of the leading `# key: JSON` lines, every key once."""
     metadata: dict[str, Any] = {}
     for number, line in enumerate(lines, start=1):
@@ -194,7 +193,7 @@ def _no_constant(text: str) -> NoReturn:
     raise ValueError(f"{text} is not JSON")
 
 
-def _check_geometry(path: ReferencePath, table: Table) -> None:
+def _check_geometry(path: ReferencePath, table: TextTable) -> None:
     """Reject arc length, heading or curvature that the positions contradict.
 
     Heading is compared with central differences, curvature with the circle through three points
@@ -219,13 +218,13 @@ def _check_geometry(path: ReferencePath, table: Table) -> None:
     _reject(wrong, 0, "kappa_1pm disagrees with the curvature of x, y", table)
 
 
-def _reject(wrong: NDArray[np.bool_], offset: int, message: str, table: Table) -> None:
+def _reject(wrong: NDArray[np.bool_], offset: int, message: str, table: TextTable) -> None:
     if wrong.any():
         index = int(np.flatnonzero(wrong)[0]) + offset
         table.fail(f"{message} at index {index} (line {table.lines[index]})")
 
 
-def _check_motion(path: ReferencePath, columns: dict[str, Array], table: Table) -> None:
+def _check_motion(path: ReferencePath, columns: dict[str, Array], table: TextTable) -> None:
     """Warn of acceleration or time that do not follow from the speeds, which are what counts."""
     for key, values, tolerance in (
         ("ax_mps2", path.acceleration, 1e-3),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from trajectories.catalog import from_geometry
-from trajectories.columns import COLUMNS, Table, is_number, read_table
+from trajectories.fileio import COLUMNS, TextTable, is_number, read_table
 from trajectories.geodesy import east_north_up
 from trajectories.path import MINIMUM_POINTS, SPACING, ReferencePath
 from trajectories.shapes import Geometry
@@ -189,7 +189,7 @@ def read_gps(
     return importer.path(kept, name, closed)
 
 
-def _times(table: Table, index: int) -> Array:
+def _times(table: TextTable, index: int) -> Array:
     """Seconds (n,) from a column of numbers or ISO 8601 stamps."""
     if is_number(table.rows[0][index]):
         return table.column(index)
@@ -206,7 +206,7 @@ def _times(table: Table, index: int) -> Array:
 class _Importer:
     """From points to a path, for one file: checks, spline, speed, and what there is to warn of."""
 
-    table: Table
+    table: TextTable
     kind: str
     limits: SpeedLimits
     smoothing: float

@@ -21,7 +21,7 @@ from agents.learned.container import (
 )
 from agents.learned.policy import Policy
 from lpv_track_env.observation import SCALARS, ObservationLayout
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 LAYOUT_KEYS = frozenset(("preview_steps", "preview_period", "digest", "entries"))
 

@@ -33,7 +33,7 @@ from agents.weight_tuning.features import SCALES, names
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weights import FORMAT as SCHEDULE
 from agents.weights import TrackingWeights, WeightSchedule
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 WEIGHT_POLICY = Kind(
     format="lpv-track-weights/1",

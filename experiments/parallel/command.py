@@ -18,7 +18,7 @@ from experiments.parallel.report import Summary, sentences, summarise, table
 from experiments.parallel.setup import Setup
 from experiments.parallel.supervisor import run
 from experiments.run.provenance import hardware, revision, versions
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 RUN_FILE, MAILBOX_FILE = "run.json", "mailbox.json"
 FORMAT = "lpv-track-parallel/1"

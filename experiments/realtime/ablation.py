@@ -14,7 +14,7 @@ from experiments.run.provenance import revision, versions
 from experiments.run.suites import grid
 from experiments.run.tables import estimate
 from lpv_track_env.conditions import REALTIME
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 Spec = dict[str, Any]
 

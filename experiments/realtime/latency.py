@@ -29,7 +29,7 @@ from experiments.run.suites import grid
 from experiments.run.tables import estimate
 from lpv_track_env.estimation.estimator import Estimator
 from lpv_track_env.vehicle import VEHICLES
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 Spec = dict[str, Any]
 

@@ -20,7 +20,7 @@ from experiments.report.summary import summary_section
 from experiments.report.tracking import figure_sections
 from experiments.run import tables
 from experiments.run.store import ResultStore
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 Result = Mapping[str, Any]
 

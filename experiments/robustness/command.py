@@ -19,7 +19,7 @@ from experiments.run.case import project_digest
 from experiments.run.provenance import hardware, revision, versions
 from lpv_track_env import conditions
 from lpv_track_env.threads import checked_threads
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 MOST_SPAN = 1e4
 

@@ -172,7 +172,7 @@ def _replay(options: argparse.Namespace, console: Console) -> int:
     from experiments.ros.replay import replay
     from lpv_track_env import vehicle
     from lpv_track_env.estimation.observer import PathObserver
-    from trajectories.atomic import write_atomically
+    from trajectories.fileio import write_atomically
 
     path = trajectories.load(options.trajectory)
     car = vehicle.load(options.vehicle)

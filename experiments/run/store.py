@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.run.provenance import provenance
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 Array = NDArray[np.float64]
 

@@ -37,7 +37,7 @@ from experiments.speed import (
 )
 from experiments.speed.figures import picture
 from experiments.speed.measure import FULL, QUICK, Effort, Section, Tick
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 from trajectories.naming import choose
 
 FORMAT = "lpv-track-speed/1"

@@ -21,7 +21,7 @@ from experiments.study.oracle import Headroom
 from experiments.study.report import write_report
 from experiments.study.study import Study, checked_labels, run_judging, run_trainings
 from experiments.tuning.loop import WEIGHTS
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 from trajectories.importers import read_racetrack
 
 ORACLE, REPORT = "oracle.json", "report.html"

@@ -17,7 +17,7 @@ from experiments.study import figures, tables
 from experiments.study.ladder import BASELINE, OURS, PPO
 from experiments.study.oracle import Headroom
 from experiments.study.study import Study
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 FORMULA = (
     "score = rms lateral error / 0.05 m + rms heading error / 0.1 rad + rms speed error / 0.5 m/s "

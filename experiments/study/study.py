@@ -21,7 +21,7 @@ from experiments.run.engines import local_pool
 from experiments.study.evaluation import FIGURES, EvaluationSet, Judge
 from experiments.study.ladder import EVERY, Rung, rung
 from experiments.tuning.loop import PROGRESS, WEIGHTS, Listener, tune
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 from trajectories.naming import choose
 
 Array = NDArray[Any]

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 FORMAT = "lpv-track-checkpoint/1"
 NAME = "checkpoint.pt"

@@ -25,7 +25,7 @@ from experiments.training.settings import TrainingSettings, difference
 from experiments.training.trainer import Trainer
 from experiments.training.validation import validate
 from lpv_track_env import vehicle
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 POLICY, PROGRESS, SETTINGS = "policy.json", "progress.jsonl", "settings.json"
 

@@ -17,7 +17,7 @@ from experiments.tuning.settings import PPO_METHODS, TuningSettings
 from experiments.tuning.tuner import Result, Tuner
 from lpv_track_env import vehicle
 from trajectories import CurvatureBands, ReferencePath
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 WEIGHTS, PROGRESS, SETTINGS = "weights.json", "progress.jsonl", "settings.json"
 

@@ -28,7 +28,7 @@ from experiments.tuning.quadratic import PairedQuadratic, Prior
 from experiments.tuning.settings import TuningSettings
 from experiments.tuning.tuner import Tuner, unusable
 from trajectories import ReferencePath
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 STATE = "paired.npz"
 LARGEST = 4.0

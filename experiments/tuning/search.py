@@ -22,7 +22,7 @@ from experiments.tuning.drives import TuningDrives, weights_at
 from experiments.tuning.settings import TuningSettings
 from experiments.tuning.tuner import Tuner, unusable
 from trajectories import CurvatureBands, ReferencePath
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 Array = NDArray[Any]
 

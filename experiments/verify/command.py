@@ -24,7 +24,7 @@ from experiments.run.suites import PAPER_VEHICLES
 from experiments.verify.bench import FATROP_EVERY, run_situation, situation_death
 from experiments.verify.situations import kind
 from experiments.verify.verdict import QUANTILES, number, shortfalls, summarise
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 SOLVER = "agents.nmpc.rti_solver:RtiSolver"
 QUICK = 24

@@ -7,7 +7,7 @@ import pytest
 
 from experiments.run import store as results
 from experiments.run.store import ResultStore
-from trajectories.atomic import write_atomically
+from trajectories.fileio import write_atomically
 
 
 def result(name, **more):

@@ -1,6 +1,8 @@
-"""Separated text files of points: cells, headers, and what the columns are called."""
+"""Read text files of points, and write any file as a whole or not at all."""
 
 import math
+import os
+import secrets
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -19,11 +21,12 @@ COLUMNS = {
     "time": ("t", "t_s", "time", "time_s", "timestamp"),
     "width": ("w_tr_right_m", "w_tr_left_m"),
 }
+"""Names that a column of each quantity may have in a header, in lower case."""
 
 
 @dataclass(frozen=True)
-class Table:
-    """Cells of a separated text file: header (lower case, may be empty), rows and their lines."""
+class TextTable:
+    """Cells of a text file: header (lower case, may be empty), rows and their line numbers."""
 
     file: Path
     header: tuple[str, ...]
@@ -31,18 +34,18 @@ class Table:
     lines: list[int]
 
     def fail(self, message: str) -> NoReturn:
-        """Raise a ValueError that names the file."""
+        """Raise a ValueError that begins with the file's name."""
         raise ValueError(f"{self.file}: {message}")
 
     def find(self, quantity: str) -> int | None:
-        """Index of a quantity's column by its known names."""
+        """Return the index of a quantity's column, one of `COLUMNS`; None if there is none."""
         for name in COLUMNS[quantity]:
             if name in self.header:
                 return self.header.index(name)
         return None
 
     def column(self, index: int) -> Array:
-        """One column's numbers, (n,), finite."""
+        """Return the numbers of a column, (n,); a cell that is not a finite number is an error."""
         name = self.header[index] if self.header else str(index + 1)
         values = np.empty(len(self.rows))
         for k, (row, line) in enumerate(zip(self.rows, self.lines, strict=True)):
@@ -56,7 +59,7 @@ class Table:
 
 
 def read_text(file: str | Path) -> str:
-    """Text of a file; every failure to read it is a ValueError of one line."""
+    """Read a text file; raise a ValueError of one line if it cannot be read."""
     try:
         return Path(file).read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -65,13 +68,13 @@ def read_text(file: str | Path) -> str:
         raise ValueError(f"{file}: is not a text file (byte {error.start})") from error
 
 
-def read_table(file: str | Path) -> Table:
-    """Split a text file at `,` or `;`; a header may be a `#` comment or a line without numbers.
+def read_table(file: str | Path) -> TextTable:
+    """Split a text file at `,` or `;`; its header may be a `#` comment or a line without numbers.
 
     Raises
     ------
     ValueError
-        For a file that cannot be read, has no rows, or a row of another number of cells.
+        For a file that cannot be read or has no rows, or if rows differ in their number of cells.
     """
     comments: list[tuple[str, ...]] = []
     header: tuple[str, ...] = ()
@@ -90,7 +93,7 @@ def read_table(file: str | Path) -> Table:
         else:
             rows.append(cells)
             lines.append(number)
-    table = Table(Path(file), header, rows, lines)
+    table = TextTable(Path(file), header, rows, lines)
     if not rows:
         table.fail("has no rows of numbers")
     width = len(header or rows[0])
@@ -100,14 +103,34 @@ def read_table(file: str | Path) -> Table:
     if not header:
         known = {name for group in COLUMNS.values() for name in group}
         fitting = [c for c in comments if len(c) == width and len(known.intersection(c)) >= 2]
-        table = Table(table.file, fitting[-1] if fitting else (), rows, lines)
+        table = TextTable(table.file, fitting[-1] if fitting else (), rows, lines)
     return table
 
 
 def is_number(text: str) -> bool:
-    """Whether a cell reads as a number, NaN and infinity included."""
+    """Return whether a cell can be read as a number; NaN and infinity count as numbers."""
     try:
         float(text)
     except ValueError:
         return False
     return True
+
+
+def write_atomically(file: Path, content: bytes) -> None:
+    """Replace a file: temporary file in the same folder (made if need be), fsync, rename.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; what was there before is untouched, nothing is left beside it.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    temporary = file.with_name(f".{file.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with temporary.open("wb") as handle:
+            handle.write(content)
+            handle.flush()
+            os.fsync(handle.fileno())
+        temporary.replace(file)
+    finally:
+        temporary.unlink(missing_ok=True)
