@@ -1,0 +1,66 @@
+"""Two folders of results held against each other."""
+
+from pathlib import Path
+
+import pytest
+
+from experiments.run.compare import EXAMPLE, compare, main
+from tests.helpers.made_results import case, folder_of
+
+
+def test_equal_results_have_no_difference(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither ids, order nor times count."""
+    first = [case(1), case(2, trajectory="T4")]
+    second = [
+        case(7, trajectory="T4", solver={"median": 0.003}, seconds=9.0),
+        case(8, solver={"p99": 0.1}),
+    ]
+    folder_of(tmp_path / "a", first, traces=False)
+    folder_of(tmp_path / "b", second, traces=False)
+    assert main([str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    said = capsys.readouterr().out
+    assert "2 cases in both" in said
+    assert "no differences" in said
+    assert "stanley 2.000 -> 2.500 ms" in said
+
+
+def test_the_last_digit_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder_of(tmp_path / "a", [case(1), case(2, seed=1)], traces=False)
+    changed = case(1, metrics={"ale": 0.08 + 2**-53}, end="left")
+    folder_of(tmp_path / "b", [changed, case(2, seed=1)], traces=False)
+    found = compare(tmp_path / "a", tmp_path / "b")
+    assert found.paired == 2
+    assert [line.split(": ")[1] for line in found.differences] == [
+        "end finished -> left", f"metrics.ale 0.08 -> {0.08 + 2**-53}",
+    ]  # fmt: skip
+    assert main([str(tmp_path / "a"), str(tmp_path / "b")]) == 1
+    assert "2 differences" in capsys.readouterr().out
+
+
+def test_cases_of_one_folder_alone_are_differences(tmp_path: Path) -> None:
+    folder_of(tmp_path / "a", [case(1), case(2, agent="lqr")], traces=False)
+    # The first of two runs of one case no longer counts.
+    runs = [case(1, metrics={"ale": 1.0}), case(3), case(4, agent_settings={"gain": 2.0})]
+    folder_of(tmp_path / "b", runs, traces=False)
+    found = compare(tmp_path / "a", tmp_path / "b")
+    assert found.paired == 1
+    lost, added = found.differences
+    assert "agent lqr" in lost
+    assert lost.endswith(f"only in {tmp_path / 'a'}")
+    assert "agent_settings {'gain': 2.0}" in added
+    assert added.endswith(f"only in {tmp_path / 'b'}")
+
+
+def test_no_results_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder_of(tmp_path / "a", [case(1)], traces=False)
+    assert main([str(tmp_path / "a"), str(tmp_path / "none")]) == 2
+    assert f"no results in {tmp_path / 'none'}" in capsys.readouterr().out
+    assert not (tmp_path / "none").exists()
+
+
+def test_help_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert EXAMPLE in capsys.readouterr().out
