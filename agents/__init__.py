@@ -1,6 +1,6 @@
-"""Agents of lpv-track-env: everything that drives, behind one `predict`.
+"""Agents that drive the environments, all with the interface `predict`.
 
-`make(name, env, **settings)` makes one; `names()` lists them.
+`make(name, env, **settings)` makes an agent; `names()` lists the known names.
 """
 
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ __all__ = ["Agent", "DrivingTask", "TrackingAgent", "make", "names", "sb3_vec_en
 
 
 def sb3_vec_env(env: "PathTrackingVectorEnv") -> "TrackingVecEnv":
-    """Return Stable-Baselines3's `VecEnv` of a vector environment; see `agents.sb3`.
+    """Wrap a vector environment as a `VecEnv` of Stable-Baselines3; see `agents.sb3`.
 
     Raises
     ------

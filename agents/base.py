@@ -1,13 +1,14 @@
-"""The one way to act: `predict`, Stable-Baselines3's policy protocol.
+"""Interface of all agents: `predict`, as in the policies of Stable-Baselines3.
 
-Anything with `predict(observation, state, episode_start, deterministic) -> (action, state)` drives:
-it passes through SB3's `evaluate_policy`, this project's rollouts and its reports. `TrackingAgent`
-makes such an agent from one method that controls a single vehicle.
+Anything with `predict(observation, state, episode_start, deterministic) -> (action, state)` can
+drive: in SB3's `evaluate_policy`, in this project's rollouts and in its reports. Subclass
+`TrackingAgent` to write an agent as one method, `control`, for a single vehicle.
 """
 
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 import gymnasium
@@ -23,11 +24,14 @@ from trajectories import ReferencePath
 Action = NDArray[np.float32]
 Memory = TypeVar("Memory")
 
-NOTHING_DELAYED = Actuation()
+CHECKPOINTS = Path(__file__).parent / "checkpoints"
+"""Folder of the policies that come with this project: NAME.json for the agent NAME."""
+
+NO_DELAYS = Actuation()
 
 
 class Agent(Protocol):
-    """What everything that drives implements."""
+    """Protocol of everything that drives."""
 
     def predict(
         self,
@@ -36,49 +40,57 @@ class Agent(Protocol):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Action, Any]:
-        """Action(s) [a m/s^2, delta rad] for one observation (size,) or a batch (n, size).
+        """Return actions [a m/s^2, delta rad], and the agent's memory after them.
 
-        `state` is what the last call returned (None: the agent's own memory); rows that
-        `episode_start` (n,) marks begin a new episode.
+        Parameters
+        ----------
+        observation
+            One observation (size,), or a batch (n, size).
+        state
+            Memory that the last call returned; None uses the one kept in the agent.
+        episode_start
+            (n,) bool, True for rows in which a new episode begins.
+        deterministic
+            Part of SB3's protocol: no exploration noise.
         """
         ...
 
 
 @dataclass(frozen=True)
 class DrivingTask:
-    """What an agent may know beforehand of what it will drive: the vehicle, periods, bounds.
+    """Knowledge that an agent has at design time: vehicle, periods, action bounds.
 
-    `path` is known at design time only, for rules that choose settings from the whole path (the
-    paper's weights); what an agent does from step to step it does on the observation.
+    `path` is for rules that derive settings from the whole path (the paper's choice of weights).
+    While driving, an agent uses observations only.
     """
 
     layout: ObservationLayout
     vehicle: VehicleParameters
     control_period: float
     path: ReferencePath
-    actuation: Actuation = NOTHING_DELAYED
-    """Delays and lags between a command and its effect, nominal (s)."""
+    actuation: Actuation = NO_DELAYS
+    """Nominal delays and lags between a command and its effect, s."""
 
     @property
     def delayed(self) -> bool:
-        """Whether there are any."""
+        """True if the actuation has any delay or lag."""
         return any(time > 0.0 for time in self.actuation)
 
     @property
     def action_bounds(self) -> tuple[Action, Action]:
-        """The action space's own float32 bounds, (2,): an action clipped to them lies in it."""
+        """Lower and upper bound of the action space, (2,) float32 [m/s^2, rad]."""
         low, high = self.vehicle.acceleration_range
         limit = self.vehicle.max_steering_angle
         return np.array([low, -limit], np.float32), np.array([high, limit], np.float32)
 
     @classmethod
     def of(cls, env: gymnasium.Env[Any, Any]) -> "DrivingTask":
-        """Read it off an environment (wrapped or not).
+        """Collect the task from an environment, wrapped or not.
 
         Raises
         ------
         TypeError
-            If the environment is not one of path tracking.
+            If it is not a path tracking environment.
         """
         names = ("layout", "vehicle", "control_period", "path", "actuation")
         try:
@@ -91,7 +103,7 @@ class DrivingTask:
 
 def stopping_acceleration(vehicle: VehicleParameters, speed: float) -> float:
     """Acceleration command (m/s^2) of a controlled stop from a speed (m/s), down to standstill."""
-    # Where the speed is unknown it rolls on: braking blindly would end in reverse.
+    # With an unknown speed the vehicle coasts: braking blindly would end in reverse.
     speed = max(speed, 0.0) if math.isfinite(speed) else 0.0
     command: float = controlled_stop(vehicle.rolling_deceleration, vehicle.max_jerk, speed)
     return command
@@ -100,9 +112,9 @@ def stopping_acceleration(vehicle: VehicleParameters, speed: float) -> float:
 def blind_control(
     vehicle: VehicleParameters, observation: TrackingObservation
 ) -> tuple[float, float]:
-    """Inputs (m/s^2, rad) for an observation that is not finite: steering held, braking to a stop.
+    """Return inputs (m/s^2, rad) for an observation that is not finite: hold the steering and stop.
 
-    Its speed and its steering angle count where they are finite.
+    Its speed and steering angle are used if they are finite.
     """
     speed, steering = float(observation.longitudinal_speed), float(observation.steering_angle)
     return (
@@ -112,12 +124,12 @@ def blind_control(
 
 
 def observation_rows(observation: NDArray[Any], size: int) -> NDArray[np.float64]:
-    """One observation (size,), or a batch (n, size), as rows (n, size) for compiled code: a copy.
+    """Copy one observation (size,) or a batch (n, size) into rows (n, size) float64.
 
     Raises
     ------
     ValueError
-        If it has another size.
+        If the observation has another size.
     """
     rows = np.array(observation, dtype=np.float64, order="C")
     if rows.ndim == 1:
@@ -131,10 +143,10 @@ def observation_rows(observation: NDArray[Any], size: int) -> NDArray[np.float64
 
 
 class TrackingAgent(ABC, Generic[Memory]):
-    """An agent made from `control`, which drives one vehicle on one observation.
+    """Base class of agents that are written as `control`, for one vehicle and one observation.
 
-    It keeps one memory per row of a batch; rows that `episode_start` marks get a new one. What an
-    observation with entries that are not finite gets is decided by `control_blind`.
+    Each row of a batch has its own memory, which is renewed where `episode_start` is True.
+    `control_blind` acts in place of `control` on observations with NaN or infinite entries.
     """
 
     def __init__(self, task: DrivingTask) -> None:
@@ -144,25 +156,25 @@ class TrackingAgent(ABC, Generic[Memory]):
 
     @abstractmethod
     def control(self, observation: TrackingObservation, memory: Memory) -> tuple[float, float]:
-        """Acceleration (m/s^2) and steering angle (rad) for one observation; may write memory."""
+        """Return acceleration (m/s^2) and steering angle (rad); may change the memory."""
 
     def control_blind(
         self,
         observation: TrackingObservation,
         memory: Memory,  # noqa: ARG002  for subclasses
     ) -> tuple[float, float]:
-        """Inputs for an observation that is not finite: steering held, braking to a stop.
+        """Return inputs for an observation that is not finite: hold the steering and stop.
 
-        The memory is left alone: one NaN in an integral would stay there for good.
+        The memory is not changed: one NaN in an integrator would never leave it.
         """
         return blind_control(self.task.vehicle, observation)
 
     @abstractmethod
     def new_memory(self) -> Memory:
-        """Memory of a vehicle at the start of an episode."""
+        """Return the memory of a vehicle at the start of an episode."""
 
     def diagnostics(self, memory: Memory) -> dict[str, Any]:  # noqa: ARG002  for subclasses
-        """What the agent can tell of its last step for one vehicle; empty if nothing.
+        """Return details of the last step for one vehicle; empty if there are none.
 
         Known entries: status, seconds, iterations, cost, slack (3,), fallback, weights (10,),
         plan (n, 2) in the frame of the path's foot point.
@@ -170,7 +182,7 @@ class TrackingAgent(ABC, Generic[Memory]):
         return {}
 
     def reset(self) -> None:
-        """Forget everything: the next call begins new episodes."""
+        """Discard all memories: the next call begins new episodes."""
         self._memories = []
 
     def predict(
@@ -180,7 +192,7 @@ class TrackingAgent(ABC, Generic[Memory]):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,  # noqa: ARG002  part of the protocol
     ) -> tuple[Action, list[Memory]]:
-        """Action (2,) for one observation (size,), or (n, 2) for a batch; and the memories.
+        """Return the action (2,) for one observation (size,), or (n, 2) for a batch; and memories.
 
         Raises
         ------
