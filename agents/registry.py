@@ -1,4 +1,4 @@
-"""Agents by name; a name's module is imported only when it is made."""
+"""Agents by name. The module of an agent is imported when the agent is made."""
 
 import importlib
 import importlib.util
@@ -11,8 +11,10 @@ from types import ModuleType
 from typing import Any
 
 import gymnasium
+import numpy as np
+from numpy.typing import NDArray
 
-from agents.base import Agent, DrivingTask
+from agents.base import CHECKPOINTS, Action, Agent, DrivingTask
 from trajectories.naming import suggestion
 
 REGISTRY: dict[str, str] = {
@@ -28,38 +30,34 @@ REGISTRY: dict[str, str] = {
     "sac": "agents.learned.agent:Sac",
     "bc": "agents.learned.agent:Bc",
 }
-"""Name -> "module:Class"; the class takes a `DrivingTask` and its own keyword settings."""
-
-
-CHECKPOINTS = Path(__file__).parent / "checkpoints"
-"""Folder of the learned policies that come with this project: NAME.json for the agent NAME."""
+"""Name -> "module:Class". The class takes a `DrivingTask` and its own keyword settings."""
 
 POLICY_FILES = (".json", ".safetensors", ".zip")
-"""How the name of a learned policy's file ends; of the last two it is said what to give instead."""
+"""Suffixes of policy files. The error for the last two says which file to give instead."""
 
 COMMON = ("delay_compensation",)
-"""Settings that `make` itself takes, for every agent; some classes take it from there."""
+"""Settings that `make` accepts for every agent."""
 
 
 def names() -> list[str]:
-    """Names that `make` knows."""
+    """List the names that `make` knows."""
     return list(REGISTRY)
 
 
 def agent_class(name: str) -> Callable[..., Any]:
-    """Class behind a name, or behind a "module:Class" or "file.py:Class" of the user's own.
+    """Find the class of a name, or of the user's own "module:Class" or "file.py:Class".
 
-    For the .json of a learned policy, what makes its agent.
+    For the .json of a learned policy, return a function that makes its agent.
 
     Raises
     ------
     ValueError
-        For an unknown name, with the known ones and the nearest; or a file that cannot be used.
+        For an unknown name, listing the known ones and the nearest; or for an unusable file.
     """
     if name.endswith(POLICY_FILES):
-        from agents.learned.agent import of_file
+        from agents.learned.agent import agent_of_file
 
-        return of_file(name)
+        return agent_of_file(name)
     target = REGISTRY.get(name, name)
     module, separator, attribute = target.rpartition(":")
     if not separator:
@@ -79,7 +77,7 @@ def agent_class(name: str) -> Callable[..., Any]:
 
 @cache
 def _module_of(file: Path) -> ModuleType:
-    """A user's file as a module, loaded once a process."""
+    """Import a user's file as a module, once per process."""
     name = f"lpv_track_user_{file.stem}"
     spec = importlib.util.spec_from_file_location(name, file)
     if spec is None or spec.loader is None:
@@ -91,10 +89,10 @@ def _module_of(file: Path) -> ModuleType:
 
 
 def source_file(name: str) -> Path | None:
-    """File whose contents belong to a result, beside this project's sources; None if there is none.
+    """Return the file on which an agent's results depend besides this project's sources, or None.
 
-    That of a user's own agent, or of a learned policy, a shipped one too: its digest of the weights
-    stands for these.
+    It is the source of a user's own agent, or the .json of a learned policy, shipped or not; that
+    file contains a digest of the network's weights.
     """
     if name.endswith(".json"):
         return Path(name)
@@ -114,17 +112,17 @@ def source_file(name: str) -> Path | None:
 
 
 def check_settings(name: str, settings: Iterable[str]) -> None:
-    """Refuse settings that an agent's class does not take.
+    """Check the names of settings for one agent.
 
     Raises
     ------
     ValueError
-        Naming the agent, its settings and the nearest.
+        For an unknown one, listing the agent's settings and the nearest.
     """
     cls = agent_class(name)
     try:
         parameters = list(inspect.signature(cls).parameters.values())[1:]
-    except (TypeError, ValueError):  # not a class, or one that does not tell
+    except (TypeError, ValueError):  # not a class, or one without a signature
         return
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
@@ -142,41 +140,74 @@ def make(
     delay_compensation: bool | None = None,
     **settings: Any,
 ) -> Agent:
-    """Make an agent for an environment; `settings` are its class's keyword arguments.
+    """Make an agent for an environment.
 
     Parameters
     ----------
     name
-        As `names` lists it, or "module:Class", "file.py:Class", or the .json of a learned policy.
+        One of `names()`, or "module:Class", "file.py:Class", or the .json of a learned policy.
     env
-        What it will drive, wrapped or not.
+        Environment to drive, wrapped or not.
     delay_compensation
-        Whether it is shown the observation of the time at which its action lands
-        (`agents.delay.DelayCompensated`); by default where the environment's conditions have
-        delays. A class that says `compensates_delays` is handed this instead.
+        Predict the observation to the time at which the action takes effect
+        (`agents.delay.DelayCompensated`). Default: if the environment's conditions have delays.
+        Classes with `compensates_delays` receive this setting and do it themselves.
+    **settings
+        Keyword arguments of the agent's class.
 
     Raises
     ------
     ValueError
-        For an unknown name or setting, or an environment of another kind.
+        For an unknown name or setting, or another kind of environment.
     """
     cls = agent_class(name)
     check_settings(name, settings)
-    itself = getattr(cls, "compensates_delays", False)
-    if itself:
+    compensates = getattr(cls, "compensates_delays", False)
+    if compensates:
         settings["delay_compensation"] = delay_compensation
     try:
         task = DrivingTask.of(env)
         agent: Agent = cls(task, **settings)
     except TypeError as error:
         raise ValueError(f"agent {name!r}: {error}") from error
-    compensated = task.delayed if delay_compensation is None else delay_compensation
-    if compensated and not itself:
+    wanted = task.delayed if delay_compensation is None else delay_compensation
+    if wanted and not compensates:
         from agents.delay import DelayCompensated
 
         agent = DelayCompensated(agent, task, task.actuation, settings.get("model"))
     if env.observation_space.shape != (task.layout.size,):
-        from agents.surroundings import TrackingPart
-
-        agent = TrackingPart(agent, task)
+        agent = TrackingPartAgent(agent, task)
     return agent
+
+
+class TrackingPartAgent:
+    """Agent in an environment whose observation is longer than the tracking observation.
+
+    It hands on the tracking part (`ObservationLayout.tracking_part`) of each observation.
+
+    Parameters
+    ----------
+    agent
+        Agent for the tracking observation.
+    task
+        Task with the layout of the tracking observation.
+    """
+
+    def __init__(self, agent: Agent, task: DrivingTask) -> None:
+        self.agent, self.task = agent, task
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "agent":  # not yet there while a copy or a pickle is made
+            raise AttributeError(name)
+        return getattr(self.agent, name)
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Action, Any]:
+        """Return the agent's action for the tracking part of an observation, and its memory."""
+        part = self.task.layout.tracking_part(observation)
+        return self.agent.predict(part, state, episode_start, deterministic)

@@ -9,8 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from agents.learned.files import write
-from agents.learned.policy import Policy
+from agents.learned.policy import Policy, write
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.task import action_space
 from lpv_track_env.vehicle import VehicleParameters, load

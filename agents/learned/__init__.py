@@ -1,6 +1,5 @@
-"""Learned policies: what they are, their files, and the agents that run them without torch."""
+"""Learned policies: their files, and the agents that run them without torch."""
 
-from agents.learned.files import read, write
-from agents.learned.policy import Policy
+from agents.learned.policy import Policy, read, write
 
 __all__ = ["Policy", "read", "write"]

@@ -7,47 +7,50 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.base import Action, DrivingTask, blind_control, observation_rows
-from agents.learned.files import read
+from agents.base import (
+    CHECKPOINTS,
+    Action,
+    DrivingTask,
+    blind_control,
+    check_compatible,
+    observation_rows,
+)
 from agents.learned.network import Network
-from agents.learned.policy import ACTIONS, Policy
-from agents.made_for import check_task
+from agents.learned.policy import ACTIONS, Policy, read
 from agents.nmpc.rti_agent import RtiMemory, RtiNmpc, RtiRow
-from agents.registry import CHECKPOINTS
 
 Memory = RtiMemory | list[None]
 
 
 class LearnedPolicy:
-    """Drives as a policy says; for origin "lpv-nmpc", on top of that agent.
+    """Agent that runs a learned policy; with origin "lpv-nmpc" it corrects that agent's action.
 
-    An observation that is not finite gets what every agent gives it (steering held, braking to a
-    stop), and so does one of which the network makes no number; for origin "lpv-nmpc" it gets what
-    that agent itself does.
+    If the observation or the network's output is not finite, the agent holds the steering and
+    brakes to a stop, as every agent does; with origin "lpv-nmpc" that agent's own action is used.
 
     Parameters
     ----------
     task
-        What is driven.
+        Task to drive.
     policy
         A policy, or the .json of one.
 
     Raises
     ------
     ValueError
-        For a file that cannot be used, or a policy made for other observations or another control
-        period than the task's; the message says which.
+        For an unusable file, or for a policy that was made for another observation layout or
+        control period than the task's.
     """
 
     def __init__(self, task: DrivingTask, policy: str | Path | Policy) -> None:
         self.task = task
         name = f"policy {policy.algorithm!r}" if isinstance(policy, Policy) else f"policy {policy}"
         self.policy = policy if isinstance(policy, Policy) else read(policy)
-        check_task(name, self.policy, task, stacklevel=4)
+        check_compatible(name, self.policy, task, stacklevel=4)
         self._size = task.layout.size
         self._network = Network.of(self.policy, *task.action_bounds)
         self._base = RtiNmpc(task) if self.policy.origin == "lpv-nmpc" else None
-        # Of no rows: so it compiles here, if need be, and not within the first control period.
+        # With zero rows: compile here, if need be, not in the first control period.
         self._network.act(np.zeros((0, self._size)), np.zeros((0, ACTIONS)))
 
     def predict(
@@ -57,9 +60,9 @@ class LearnedPolicy:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Action, Memory]:
-        """Action (2,) for one observation (size,), or (n, 2) for a batch; and the memory.
+        """Return the action (2,) for one observation (size,), or (n, 2) for a batch; and memory.
 
-        The memory is the base's, if there is one: a network alone remembers nothing.
+        It is the memory of the base agent; a network alone has none.
 
         Raises
         ------
@@ -75,47 +78,47 @@ class LearnedPolicy:
         actions = base.astype(np.float64)
         if self._network.act(rows, actions):
             for row in np.flatnonzero(np.isnan(actions[:, 0])).tolist():
-                actions[row] = self._instead(rows[row], base[row])
+                actions[row] = self._replacement(rows[row], base[row])
         given = actions.astype(np.float32)
         return (given[0] if np.ndim(observation) == 1 else given), memory
 
-    def _instead(self, row: NDArray[np.float64], base: Action) -> NDArray[Any]:
-        """Action (2,) where the network has none."""
+    def _replacement(self, row: NDArray[np.float64], base: Action) -> NDArray[Any]:
+        """Return the action (2,) that replaces an output that is not finite."""
         if self._base is not None:
             return base
         stop = blind_control(self.task.vehicle, self.task.layout.unpack(row))
         return np.clip(stop, *self.task.action_bounds)
 
     def reset(self) -> None:
-        """Forget everything: the next call begins new episodes."""
+        """Discard all memories: the next call begins new episodes."""
         if self._base is not None:
             self._base.reset()
 
     def diagnostics(self, memory: RtiRow | None) -> dict[str, Any]:
-        """What the base can tell of its last step for one vehicle; empty without one."""
+        """Return the base agent's diagnostics for one vehicle; empty without a base agent."""
         if self._base is None or memory is None:
             return {}
         return self._base.diagnostics(memory)
 
 
-def of_file(file: str | Path) -> Callable[[DrivingTask], LearnedPolicy]:
-    """What makes the agent of a policy file, as a class makes its own; the file is read here.
+def agent_of_file(file: str | Path) -> Callable[[DrivingTask], LearnedPolicy]:
+    """Check a policy file, and return a function that makes its agent for a task.
 
     Raises
     ------
     ValueError
-        For a file that cannot be used.
+        For an unusable file.
     """
     read(file)
 
-    def made(task: DrivingTask) -> LearnedPolicy:
+    def make(task: DrivingTask) -> LearnedPolicy:
         return LearnedPolicy(task, file)
 
-    return made
+    return make
 
 
 class Ppo(LearnedPolicy):
-    """Proximal policy optimisation (Schulman et al. 2017); by default the shipped policy."""
+    """Proximal policy optimisation (Schulman et al. 2017); the shipped policy by default."""
 
     def __init__(
         self, task: DrivingTask, *, policy: str | Path | Policy = CHECKPOINTS / "ppo.json"
@@ -124,7 +127,7 @@ class Ppo(LearnedPolicy):
 
 
 class Sac(LearnedPolicy):
-    """Soft actor-critic (Haarnoja et al. 2018), its mean action; by default the shipped policy."""
+    """Soft actor-critic (Haarnoja et al. 2018), mean action; the shipped policy by default."""
 
     def __init__(
         self, task: DrivingTask, *, policy: str | Path | Policy = CHECKPOINTS / "sac.json"
@@ -133,7 +136,7 @@ class Sac(LearnedPolicy):
 
 
 class Bc(LearnedPolicy):
-    """Behaviour cloning: supervised learning of the NMPC's actions; by default as shipped."""
+    """Behaviour cloning of the NMPC's actions; the shipped policy by default."""
 
     def __init__(
         self, task: DrivingTask, *, policy: str | Path | Policy = CHECKPOINTS / "bc.json"

@@ -1,155 +1,385 @@
-"""Policy files: NAME.json says what a policy is, NAME.safetensors holds its weights.
+"""Files of policies: NAME.json describes a policy, NAME.safetensors has its network's numbers.
 
-How they are kept safe is said in `agents.learned.container`.
+This is the common core; `Kind` says how the files of one kind of policy differ. Reading executes
+nothing: the files hold JSON and plain numbers, and nothing is unpickled. NAME.json contains a digest
+of itself and one of the weights, so a damaged or edited file is refused. The digests find accidents;
+they do not stop somebody from writing another policy, which can at worst drive badly.
 """
 
+import hashlib
+import json
+import re
+import reprlib
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, NoReturn
 
-import safetensors.numpy
+import numpy as np
+import safetensors
+from numpy.typing import NDArray
+from safetensors.numpy import save
 
-from agents.learned.container import (
-    Kind,
-    Spec,
-    Tensors,
-    check_suffix,
-    encoded,
-    layer_tensors,
-    layers_of,
-    read_spec,
-    read_tensors,
-    shown,
-)
-from agents.learned.policy import Policy
-from lpv_track_env.observation import SCALARS, ObservationLayout
 from trajectories.fileio import write_atomically
 
-LAYOUT_KEYS = frozenset(("preview_steps", "preview_period", "digest", "entries"))
+MOST_WEIGHTS = 64 * 2**20
+"""Largest .safetensors that is written or read, bytes."""
+MOST_SPEC = 2**20
+"""Largest .json that is written or read, bytes."""
+MOST_LAYERS = 16
+"""Largest number of layers of a network."""
 
-POLICY = Kind(
-    format="lpv-track-policy/1",
-    noun="policy",
-    keys=frozenset(
-        (
-            "algorithm", "control_period", "layout", "activation", "squash", "origin", "centre",
-            "half", "feature_limit", "symmetric",
-        )
-    ),
-    objects={"layout": LAYOUT_KEYS},
-)  # fmt: skip
+COMMON_KEYS = frozenset(
+    ("format", "control_period", "layout", "algorithm", "weights", "training", "digest")
+)
+OBJECTS: Mapping[str, frozenset[str]] = {
+    "weights": frozenset(("file", "sha256", "bytes")),
+    "layout": frozenset(("preview_steps", "preview_period", "digest", "entries")),
+}
+"""Keys of the objects that every spec has."""
+
+FAMILIES: Mapping[str, str] = {
+    "lpv-track-policy": "is a policy that drives: --agent takes it",
+    "lpv-track-weights": "is a policy of weights: agent lpv-nmpc-tuned drives with it",
+    "weight-schedule": "is a schedule of weights: the NMPC's agents take it as weights",
+}
+"""Format without its version -> hint for a user who gave such a file where another is wanted."""
+
+BESIDE = re.compile(r"[^/\\:\x00-\x1f\x7f\ud800-\udfff]+\.safetensors")
+"""Allowed names of a weights file: in the folder of its spec, on every operating system."""
+
+SHORT = reprlib.Repr()
+SHORT.maxstring = 80
+
+Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Weight (outputs, inputs) and bias (outputs,)."""
+Spec = dict[str, Any]
+"""Content of a NAME.json."""
+Tensors = dict[str, NDArray[np.float32]]
 
 
-def write(policy: Policy, file: str | Path) -> None:
-    """Write NAME.json, and NAME.safetensors beside it, each at once or not at all.
+@dataclass(frozen=True)
+class Kind:
+    """Kind of policy file.
+
+    Parameters
+    ----------
+    format
+        Name and version, FAMILY/N.
+    noun
+        Name of such a policy in messages.
+    keys
+        Keys of its spec besides `COMMON_KEYS`.
+    objects
+        Key -> keys of the objects in its spec besides `OBJECTS`.
+    stages
+        Names of the linear stages in front of the layers in the weights file.
+    """
+
+    format: str
+    noun: str
+    keys: frozenset[str]
+    objects: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    stages: tuple[str, ...] = ()
+
+
+def write_files(
+    kind: Kind, file: str | Path, spec: Spec, training: Mapping[str, Any], tensors: Tensors
+) -> None:
+    """Write NAME.safetensors, then the NAME.json that refers to it, each atomically.
+
+    Parameters
+    ----------
+    kind
+        Kind of policy.
+    file
+        NAME.json.
+    spec
+        All of the spec but format, weights, training and digest; plain JSON.
+    training
+        Origin of the policy, plain JSON.
+    tensors
+        Content of NAME.safetensors.
 
     Raises
     ------
     ValueError
-        If the file's name does not end in .json, or the policy is too large for a file.
+        If the name does not end in .json, or a file would be too large to be read again.
     OSError
         If a file cannot be written.
     """
-    spec: Spec = {
-        "algorithm": policy.algorithm,
-        "control_period": policy.control_period,
-        "layout": layout_spec(policy.layout),
-        "activation": policy.activation,
-        "squash": policy.squash,
-        "origin": policy.origin,
-        "centre": policy.centre.tolist(),
-        "half": policy.half.tolist(),
-        "feature_limit": policy.feature_limit,
-        "symmetric": policy.symmetric,
-    }
-    weights = safetensors.numpy.save(_tensors(policy))
-    for path, content in encoded(POLICY, Path(file), spec, policy.training, weights):
-        write_atomically(path, content)
-
-
-def read(file: str | Path) -> Policy:
-    """Read a policy that `write` has written; nothing of the files is run.
-
-    Raises
-    ------
-    ValueError
-        In one line that names the file and what to do: for files that are missing, torn, changed,
-        too large, of another format version, or made for other entries of the observation.
-    """
     file = Path(file)
-    _refuse_models(file)
-    check_suffix(POLICY, file)
-    spec = read_spec(POLICY, file)
-    layout = read_layout(file, spec["layout"])
-    tensors = read_tensors(POLICY, file, spec, before=("features",))
-    try:
-        return Policy(
-            algorithm=spec["algorithm"],
-            layout=layout,
-            control_period=spec["control_period"],
-            feature_weight=tensors["features.weight"],
-            feature_bias=tensors["features.bias"],
-            feature_limit=spec["feature_limit"],
-            layers=layers_of(tensors),
-            activation=spec["activation"],
-            squash=spec["squash"],
-            origin=spec["origin"],
-            centre=spec["centre"],
-            half=spec["half"],
-            training=spec["training"],
-            symmetric=spec["symmetric"],
-        )
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
-
-
-def _refuse_models(file: Path) -> None:
-    if file.suffix == ".zip":
+    if file.suffix != ".json":
+        raise ValueError(f"{file}: a {kind.noun} is written to NAME.json, give it such a name")
+    beside = file.with_suffix(".safetensors")
+    if not BESIDE.fullmatch(beside.name):
         raise ValueError(
-            f"{file} is a model of Stable-Baselines3, which runs code when it is loaded: if you "
-            f"trust it, lpv-track import-policy {file} --algorithm ppo --trust "
-            f"--out {file.with_suffix('.json')}"
+            f"{file.name!r} is no name for a {kind.noun}: leave out \\, : and the like"
         )
+    weights = save(tensors)
+    whole: Spec = {
+        "format": kind.format,
+        **spec,
+        "weights": {
+            "file": beside.name, "sha256": hashlib.sha256(weights).hexdigest(),
+            "bytes": len(weights),
+        },
+        "training": training,
+    }  # fmt: skip
+    text = json.dumps({**whole, "digest": _digest(whole)}, indent=2, allow_nan=False) + "\n"
+    for content, most in ((weights, MOST_WEIGHTS), (text.encode(), MOST_SPEC)):
+        if len(content) > most:
+            raise ValueError(
+                f"{file}: {_too_large(len(content), most)}: make the {kind.noun} smaller"
+            )
+    write_atomically(beside, weights)
+    write_atomically(file, text.encode())
 
 
-def _tensors(policy: Policy) -> Tensors:
-    features = {"features.weight": policy.feature_weight, "features.bias": policy.feature_bias}
-    return {**features, **layer_tensors(policy.layers)}
-
-
-def layout_spec(layout: ObservationLayout) -> Spec:
-    """What the spec of any policy says of the observations that it was made for."""
-    return {
-        "preview_steps": layout.preview_steps,
-        "preview_period": float(layout.preview_period),
-        "digest": layout.digest,
-        "entries": [[name, unit] for name, unit, _ in SCALARS],
-    }
-
-
-def read_layout(file: Path, spec: Spec) -> ObservationLayout:
-    """Layout of a spec, if this version's entries are those that the policy was made for.
+def check_suffix(kind: Kind, file: Path) -> None:
+    """Check that a file is a NAME.json.
 
     Raises
     ------
     ValueError
-        In one line that names the file: for another's entries, or what is no layout.
+        If it is not, saying which file to give instead.
     """
-    steps, period = spec["preview_steps"], spec["preview_period"]
-    if type(steps) is not int or type(period) is not float:
+    if file.suffix == ".json":
+        return
+    if file.suffix == ".safetensors":
         raise ValueError(
-            f"{file}: layout.preview_steps must be an integer, preview_period a number of s"
+            f"{file} holds a {kind.noun}'s weights alone: give its spec, "
+            f"{file.with_suffix('.json')}"
+        )
+    raise ValueError(f"{file} is no {kind.noun} file: give the NAME.json that it was written to")
+
+
+def read_spec(kind: Kind, file: Path) -> Spec:
+    """Read a spec, checking its format, its keys and its digest.
+
+    No key is missing or unknown, at the top and in the objects of `OBJECTS` and `kind.objects`;
+    the values are not checked.
+
+    Raises
+    ------
+    ValueError
+        In one line that names the file and what to do.
+    """
+    check_suffix(kind, file)
+    content = _content(file, MOST_SPEC, kind.noun)
+    try:
+        spec = parse_json(content.decode())
+    except UnicodeDecodeError:
+        raise ValueError(f"{file} is not JSON but binary: give a {kind.noun}'s NAME.json") from None
+    except ValueError as error:
+        raise ValueError(f"{file} is not a {kind.noun}'s JSON: {error}: copy it anew") from error
+    form = spec.get("format")
+    if form != kind.format:
+        if family(form) in FAMILIES.keys() - {family(kind.format)}:
+            raise ValueError(f"{file} {FAMILIES[family(form)]}")
+        raise ValueError(
+            f"{file}: format is {shown(form)}, this version reads {kind.format!r}: "
+            "retrain or upgrade"
+        )
+    _check_keys(kind, file, "", spec, kind.keys | COMMON_KEYS)
+    for name, keys in {**kind.objects, **OBJECTS}.items():
+        _check_keys(kind, file, f"{name}.", spec[name], keys)
+    try:
+        unchanged = spec["digest"] == _digest(spec)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{file} is not a {kind.noun}'s JSON: {error}: copy it anew") from error
+    if not unchanged:
+        raise ValueError(
+            f"{file} was changed since it was written: copy it anew, or write the {kind.noun} again"
+        )
+    return spec
+
+
+def read_tensors(kind: Kind, file: Path, spec: Spec) -> Tensors:
+    """Read the tensors of a spec's weights file after checking its size and digest.
+
+    They are the weights and biases, float32, of `kind.stages` and of 1 to `MOST_LAYERS` layers,
+    named as by `layer_tensors`. The shapes are not checked.
+
+    Raises
+    ------
+    ValueError
+        In one line that names a file and what to do.
+    """
+    again = f"write the {kind.noun} again"
+    name, size = spec["weights"]["file"], spec["weights"]["bytes"]
+    if not isinstance(name, str) or not BESIDE.fullmatch(name):
+        raise ValueError(
+            f"{file}: weights.file is {shown(name)}, not a .safetensors in the same folder: {again}"
+        )
+    beside = file.parent / name
+    content = _content(beside, MOST_WEIGHTS, kind.noun)
+    if type(size) is not int or len(content) != size:
+        raise ValueError(
+            f"{beside} has {len(content)} bytes, {shown(size)} were written: copy it anew"
+        )
+    if hashlib.sha256(content).hexdigest() != spec["weights"]["sha256"]:
+        raise ValueError(
+            f"{beside} was changed since it was written: copy it anew, together with {file.name}"
         )
     try:
-        layout = ObservationLayout(steps, period)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
-    if spec == layout_spec(layout):
-        return layout
-    before, now = spec["entries"], layout_spec(layout)["entries"]
-    if not isinstance(before, list) or before == now:
-        change = "bounds or previews"
-    elif len(before) != len(now):
-        change = f"{len(before)} scalar entries then, {len(now)} now"
-    else:
-        then, here = next((b, n) for b, n in zip(before, now, strict=True) if b != n)
-        change = f"{shown(then)} then, {shown(here)} now"
-    raise ValueError(f"{file}: made for an observation of other entries ({change}): retrain it")
+        found = dict(safetensors.deserialize(content))  # type: ignore[no-untyped-call]
+    except safetensors.SafetensorError as error:
+        reason = " ".join(str(error).split())  # it quotes the header, line breaks included
+        raise ValueError(f"{beside} is not safetensors: {reason}: {again}") from error
+    layers = len({name.rpartition(".")[0] for name in found} - set(kind.stages))
+    stages = [*kind.stages, *(f"layers.{k}" for k in range(min(max(layers, 1), MOST_LAYERS)))]
+    names = {f"{stage}.{part}" for stage in stages for part in ("weight", "bias")}
+    if names != found.keys():
+        raise ValueError(
+            f"{beside}: tensors {shown(sorted(names ^ found.keys()))} are missing or unknown: "
+            f"{again}"
+        )
+    for tensor, value in found.items():
+        if value["dtype"] != "F32":
+            raise ValueError(f"{beside}: {tensor} is {value['dtype']}, not F32: {again}")
+    tensors: Tensors = {}
+    for tensor, value in found.items():
+        try:
+            array = np.frombuffer(value["data"], dtype="<f4").reshape(value["shape"])
+        except (ValueError, OverflowError) as error:  # empty, with more rows than numpy can count
+            raise ValueError(
+                f"{beside}: {tensor} has shape {shown(value['shape'])}: {again}"
+            ) from error
+        tensors[tensor] = array
+    return tensors
+
+
+def layer_tensors(layers: tuple[Layer, ...]) -> Tensors:
+    """Name the weights and biases of layers as in a weights file."""
+    return {
+        f"layers.{k}.{part}": array
+        for k, layer in enumerate(layers)
+        for part, array in zip(("weight", "bias"), layer, strict=True)
+    }
+
+
+def layers_of(tensors: Tensors) -> tuple[Layer, ...]:
+    """Collect the layers from tensors: the inverse of `layer_tensors`, ignoring other stages."""
+    count = sum(name.startswith("layers.") for name in tensors) // 2
+    return tuple((tensors[f"layers.{k}.weight"], tensors[f"layers.{k}.bias"]) for k in range(count))
+
+
+def format_of(file: Path, noun: str) -> object:
+    """Return the "format" in a JSON file; None if it has none or is not JSON.
+
+    Raises
+    ------
+    ValueError
+        In one line for a file that cannot be read or is too large; `noun` names the wanted file.
+    """
+    content = _content(file, MOST_SPEC, noun)
+    try:
+        found = json.loads(content.decode())
+    except (ValueError, RecursionError):
+        return None
+    return found.get("format") if isinstance(found, dict) else None
+
+
+def family(form: object) -> str:
+    """Return a format without its version; "" if it is not a format."""
+    return form.rpartition("/")[0] if isinstance(form, str) else ""
+
+
+def shown(value: object) -> str:
+    """Return the repr of a value from a file, shortened to fit on a line."""
+    return SHORT.repr(value)
+
+
+def canonical(value: object) -> str:
+    """Encode plain JSON independently of white space and the order of keys."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def _digest(spec: Spec) -> str:
+    """SHA-256 of a spec without its "digest"."""
+    rest = {key: value for key, value in spec.items() if key != "digest"}
+    return hashlib.sha256(canonical(rest).encode()).hexdigest()
+
+
+def _content(file: Path, most: int, noun: str) -> bytes:
+    """Read a regular file of at most `most` bytes."""
+    try:
+        status = file.stat()
+        if not stat.S_ISREG(status.st_mode):  # reading a pipe would block
+            raise ValueError(f"{file} is not a plain file: give a {noun}'s NAME.json")
+        if status.st_size > most:
+            raise ValueError(
+                f"{file}: {_too_large(status.st_size, most)}: it is no {noun} of this project"
+            )
+        with file.open("rb") as handle:
+            return handle.read(most)
+    except FileNotFoundError:
+        raise ValueError(
+            f"there is no file {file}: give the path of a {noun}, its .safetensors beside it"
+        ) from None
+    except OSError as error:
+        raise ValueError(f"cannot read {file}: {error.strerror}") from error
+
+
+def _too_large(size: int, most: int) -> str:
+    return f"{size} bytes, at most {most} are allowed"
+
+
+def _check_keys(kind: Kind, file: Path, where: str, found: Any, known: frozenset[str]) -> None:
+    """Check that an object has exactly the known keys."""
+    again = f"write the {kind.noun} again"
+    if not isinstance(found, dict):
+        raise ValueError(f"{file}: {where.rstrip('.')} must be an object: {again}")  # noqa: TRY004
+    for what, keys in (("unknown", found.keys() - known), ("no", known - found.keys())):
+        if keys:
+            raise ValueError(
+                f"{file}: {what} key {shown(where + min(keys))}: {again} with this version"
+            )
+
+
+def plain_json(name: str, value: object) -> dict[str, Any]:
+    """Copy a mapping through JSON: tuples become lists, keys become strings.
+
+    Raises
+    ------
+    ValueError
+        If it is not a mapping, or contains something that JSON does not have.
+    """
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name} must be a mapping, not {type(value).__name__}")  # noqa: TRY004
+    try:
+        return parse_json(json.dumps(dict(value), allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{name} must be plain JSON with finite numbers: {error}") from error
+
+
+def parse_json(text: str) -> dict[str, Any]:
+    """Parse a JSON object, refusing duplicate keys, NaN and infinity.
+
+    Raises
+    ------
+    ValueError
+        Saying what is wrong and where.
+    """
+    try:
+        found = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    if not isinstance(found, dict):
+        raise ValueError(f"a JSON {type(found).__name__}, not an object")  # noqa: TRY004
+    return found
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"key {twice!r} twice")
+    return found
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not JSON")

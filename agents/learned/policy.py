@@ -1,21 +1,33 @@
-"""What a learned policy is: numbers only, checked, in SI units."""
+"""Learned policies that drive: their numbers, in SI units, and reading and writing them."""
 
-import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NoReturn, get_args
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lpv_track_env.observation import ObservationLayout
+from agents.learned.files import (
+    MOST_LAYERS,
+    Kind,
+    Layer,
+    Spec,
+    layer_tensors,
+    layers_of,
+    plain_json,
+    read_spec,
+    read_tensors,
+    shown,
+    write_files,
+)
+from lpv_track_env.observation import SCALARS, ObservationLayout
 from lpv_track_env.task import checked_period
 from trajectories.naming import choose
 
 Weights = NDArray[np.float32]
 Array = NDArray[np.float64]
-Layer = tuple[Weights, Weights]
 
 Activation = Literal["tanh", "relu"]
 Squash = Literal["tanh", "clip"]
@@ -25,14 +37,23 @@ SQUASHES: tuple[str, ...] = get_args(Squash)
 ORIGINS: tuple[str, ...] = get_args(Origin)
 
 ACTIONS = 2
-"""a, delta."""
-MOST_LAYERS = 16
+"""Entries of an action: a, delta."""
 WIDEST = 4096
+"""Largest number of outputs of a layer."""
+
+POLICY = Kind(
+    format="lpv-track-policy/1",
+    noun="policy",
+    keys=frozenset(
+        ("activation", "squash", "origin", "centre", "half", "feature_limit", "symmetric")
+    ),
+    stages=("features",),
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A policy as a file holds it: features, a multilayer perceptron, and what its output means.
+    """A policy: features, a multilayer perceptron, and the meaning of its output.
 
     With o the observation in SI units (`lpv_track_env.observation`; for origin "lpv-nmpc" followed
     by the base action)::
@@ -47,11 +68,11 @@ class Policy:
     Parameters
     ----------
     algorithm
-        "ppo", "sac", "td3", "bc", "residual", or what its maker calls it.
+        "ppo", "sac", "td3", "bc", "residual", or any other name.
     layout
-        Observations that it was made for.
+        Layout of its observations.
     control_period
-        s, that it was made for.
+        Time between its actions, s.
     feature_weight, feature_bias, feature_limit
         W_f (m, inputs), b_f (m,), limit > 0; float32.
     layers
@@ -61,23 +82,23 @@ class Policy:
     squash
         "tanh" or "clip", of the last layer's output.
     origin
-        What `base` is: "zero"; "actuators", the values in force in the observation, so that the
-        policy commands increments; "lpv-nmpc", that agent's action on the same observation.
+        Meaning of `base`: "zero"; "actuators", the observed actuator values, so that the policy
+        commands increments; "lpv-nmpc", the action of that agent on the same observation.
     centre, half
         (2,) m/s^2 and rad, float64; half >= 0.
     training
-        Where it comes from, in plain JSON: command, seed, steps, vehicle, versions, ...
+        Origin of the policy in plain JSON: command, seed, steps, vehicle, versions, ...
     symmetric
-        Whether u is the mean of the network's output and, mirrored back, of its output for the
-        mirrored observation: left and right are then the same to the policy.
+        Use the mean of the network's output and of its mirrored output for the mirrored
+        observation as u: the policy then treats left and right alike.
 
     Arrays are copied and read-only.
 
     Raises
     ------
     ValueError
-        Naming what is wrong: shapes that do not fit together, numbers that are not finite, unknown
-        names, more than 16 layers or 4096 values in one, a `training` that is not JSON.
+        For shapes that do not fit together, numbers that are not finite, unknown names, more than
+        16 layers, more than 4096 outputs of a layer, or a `training` that is not plain JSON.
     """
 
     algorithm: str
@@ -96,8 +117,7 @@ class Policy:
     symmetric: bool = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.algorithm, str) or not self.algorithm.strip():
-            raise ValueError(f"algorithm must be a name, not {self.algorithm!r}")
+        check_name(self.algorithm)
         choose("activation", self.activation, ACTIVATIONS)
         choose("squash", self.squash, SQUASHES)
         choose("origin", self.origin, ORIGINS)
@@ -110,23 +130,10 @@ class Policy:
             raise ValueError(f"half must not be negative, but is {half.tolist()}")
         _check_symmetry(self.symmetric, centre)
         weight, bias = checked_layer("feature", self.feature_weight, self.feature_bias, self.inputs)
-        if not 1 <= len(self.layers) <= MOST_LAYERS:
-            raise ValueError(f"layers must be 1 to {MOST_LAYERS}, not {len(self.layers)}")
-        layers: list[Layer] = []
-        for k, pair in enumerate(self.layers):
-            if not isinstance(pair, tuple | list) or len(pair) != 2:
-                raise ValueError(f"layers[{k}] must be a weight and a bias")
-            layers.append(
-                checked_layer(f"layers[{k}]", *pair, len(layers[-1][1] if layers else bias))
-            )
-        if len(layers[-1][1]) != ACTIONS:
-            raise ValueError(
-                f"the last layer must have {ACTIONS} outputs, for a and delta, "
-                f"not {len(layers[-1][1])}"
-            )
+        layers = checked_layers(self.layers, len(bias), ACTIONS, "for a and delta")
         normal = {
             "control_period": period, "feature_limit": limit, "centre": centre, "half": half,
-            "feature_weight": weight, "feature_bias": bias, "layers": tuple(layers),
+            "feature_weight": weight, "feature_bias": bias, "layers": layers,
             "training": plain_json("training", self.training),
         }  # fmt: skip
         for name, value in normal.items():
@@ -134,65 +141,133 @@ class Policy:
 
     @property
     def inputs(self) -> int:
-        """Length of o: the observation, and for origin "lpv-nmpc" the base action."""
+        """Length of o: the observation and, for origin "lpv-nmpc", the base action."""
         return self.layout.size + (ACTIONS if self.origin == "lpv-nmpc" else 0)
 
     @property
     def mirror(self) -> Weights:
-        """Factor of each entry of o where left and right are exchanged, (inputs,)."""
+        """Factors, 1 or -1, that exchange left and right in o, (inputs,)."""
         base = [1.0, -1.0] if self.origin == "lpv-nmpc" else []
         return np.concatenate([self.layout.mirror, base]).astype(np.float32)
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Values at each stage: inputs, features, and the outputs of every layer."""
+        """Numbers of inputs, of features, and of the outputs of every layer."""
         return self.inputs, len(self.feature_bias), *(len(bias) for _, bias in self.layers)
 
 
-def plain_json(name: str, value: object) -> dict[str, Any]:
-    """Copy a mapping that is plain JSON, as JSON gives it back: tuples become lists.
+def write(policy: Policy, file: str | Path) -> None:
+    """Write NAME.json and, beside it, NAME.safetensors, each atomically.
 
     Raises
     ------
     ValueError
-        If it is not a mapping, or holds what JSON does not.
+        If the file's name does not end in .json, or the policy is too large for a file.
+    OSError
+        If a file cannot be written.
     """
-    if not isinstance(value, Mapping):
-        raise ValueError(f"{name} must be a mapping, not {type(value).__name__}")  # noqa: TRY004
-    try:
-        return parse_json(json.dumps(dict(value), allow_nan=False))
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"{name} must be plain JSON with finite numbers: {error}") from error
+    spec: Spec = {
+        "algorithm": policy.algorithm,
+        "control_period": policy.control_period,
+        "layout": layout_spec(policy.layout),
+        "activation": policy.activation,
+        "squash": policy.squash,
+        "origin": policy.origin,
+        "centre": policy.centre.tolist(),
+        "half": policy.half.tolist(),
+        "feature_limit": policy.feature_limit,
+        "symmetric": policy.symmetric,
+    }
+    tensors = {
+        "features.weight": policy.feature_weight,
+        "features.bias": policy.feature_bias,
+        **layer_tensors(policy.layers),
+    }
+    write_files(POLICY, file, spec, policy.training, tensors)
 
 
-def parse_json(text: str) -> dict[str, Any]:
-    """Parse a JSON object: no key twice, no NaN, no infinity.
+def read(file: str | Path) -> Policy:
+    """Read a policy written by `write`; nothing in the files is executed.
 
     Raises
     ------
     ValueError
-        Saying where or what.
+        In one line that names the file and what to do: for files that are missing, torn, changed,
+        too large, of another format version, or made for other entries of the observation.
     """
+    file = Path(file)
+    if file.suffix == ".zip":
+        raise ValueError(
+            f"{file} is a model of Stable-Baselines3, which runs code when it is loaded: if you "
+            f"trust it, lpv-track import-policy {file} --algorithm ppo --trust "
+            f"--out {file.with_suffix('.json')}"
+        )
+    spec = read_spec(POLICY, file)
+    layout = read_layout(file, spec)
+    tensors = read_tensors(POLICY, file, spec)
     try:
-        found = json.loads(text, object_pairs_hook=_once, parse_constant=_refuse)
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-    if not isinstance(found, dict):
-        raise ValueError(f"a JSON {type(found).__name__}, not an object")  # noqa: TRY004
-    return found
+        return Policy(
+            layout=layout,
+            feature_weight=tensors["features.weight"],
+            feature_bias=tensors["features.bias"],
+            layers=layers_of(tensors),
+            **{key: spec[key] for key in POLICY.keys | {"algorithm", "control_period", "training"}},
+        )
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f"key {twice!r} twice")
-    return found
+def layout_spec(layout: ObservationLayout) -> Spec:
+    """Describe an observation layout in a spec."""
+    return {
+        "preview_steps": layout.preview_steps,
+        "preview_period": float(layout.preview_period),
+        "digest": layout.digest,
+        "entries": [[name, unit] for name, unit, _ in SCALARS],
+    }
 
 
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not JSON")
+def read_layout(file: Path, spec: Spec) -> ObservationLayout:
+    """Return the layout of a spec, if its entries are those of this version.
+
+    Raises
+    ------
+    ValueError
+        In one line that names the file, if they are not, or if it is not a layout.
+    """
+    described = spec["layout"]
+    steps, period = described["preview_steps"], described["preview_period"]
+    if type(steps) is not int or type(period) is not float:
+        raise ValueError(
+            f"{file}: layout.preview_steps must be an integer, preview_period a number of s"
+        )
+    try:
+        layout = ObservationLayout(steps, period)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+    if described == layout_spec(layout):
+        return layout
+    before, now = described["entries"], layout_spec(layout)["entries"]
+    if not isinstance(before, list) or before == now:
+        change = "bounds or previews"
+    elif len(before) != len(now):
+        change = f"{len(before)} scalar entries then, {len(now)} now"
+    else:
+        then, here = next((b, n) for b, n in zip(before, now, strict=True) if b != n)
+        change = f"{shown(then)} then, {shown(here)} now"
+    raise ValueError(f"{file}: made for an observation of other entries ({change}): retrain it")
+
+
+def check_name(algorithm: object) -> None:
+    """Check that a policy's `algorithm` is a name.
+
+    Raises
+    ------
+    ValueError
+        If it is not a string, or empty.
+    """
+    if not isinstance(algorithm, str) or not algorithm.strip():
+        raise ValueError(f"algorithm must be a name, not {algorithm!r}")
 
 
 def _check_symmetry(symmetric: object, centre: Array) -> None:
@@ -203,12 +278,12 @@ def _check_symmetry(symmetric: object, centre: Array) -> None:
 
 
 def checked_number(name: str, value: Any) -> float:
-    """Value as a float, if it is a number and finite.
+    """Convert a finite number to a float.
 
     Raises
     ------
     ValueError
-        Naming it, for anything else; True and False are no numbers.
+        For anything else, booleans included.
     """
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ValueError(f"{name} must be a number, not {value!r}")  # noqa: TRY004
@@ -228,7 +303,7 @@ def _array(name: str, value: ArrayLike, dtype: type[np.floating[Any]]) -> NDArra
         raise ValueError(f"{name} is not an array of numbers: {error}") from error
     if given.dtype.kind not in "fiu":
         raise ValueError(f"{name} is not an array of numbers, but of {given.dtype}")
-    with np.errstate(over="ignore"):  # beyond float32 is not finite, below
+    with np.errstate(over="ignore"):  # becomes infinite, which is refused below
         array = np.array(given, dtype=dtype, order="C")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} has values that are not finite")
@@ -243,13 +318,36 @@ def _action(name: str, value: ArrayLike) -> Array:
     return array
 
 
-def checked_layer(name: str, weight: ArrayLike, bias: ArrayLike, inputs: int) -> Layer:
-    """Weight (out, inputs) and bias (out,) of a layer, float32.
+def checked_layers(
+    layers: Sequence[Any], inputs: int, outputs: int, meaning: str
+) -> tuple[Layer, ...]:
+    """Check that layers fit one another, `inputs` and `outputs`, and copy them to float32.
 
     Raises
     ------
     ValueError
-        If they do not fit, naming the layer.
+        Naming the layer; `meaning` says in the message what the outputs are for.
+    """
+    if not 1 <= len(layers) <= MOST_LAYERS:
+        raise ValueError(f"layers must be 1 to {MOST_LAYERS}, not {len(layers)}")
+    checked: list[Layer] = []
+    for k, pair in enumerate(layers):
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise ValueError(f"layers[{k}] must be a weight and a bias")
+        checked.append(checked_layer(f"layers[{k}]", *pair, inputs))
+        inputs = len(checked[-1][1])
+    if inputs != outputs:
+        raise ValueError(f"the last layer must have {outputs} outputs, {meaning}, not {inputs}")
+    return tuple(checked)
+
+
+def checked_layer(name: str, weight: ArrayLike, bias: ArrayLike, inputs: int) -> Layer:
+    """Check the weight (out, inputs) and bias (out,) of a layer, and copy them to float32.
+
+    Raises
+    ------
+    ValueError
+        Naming the layer, if they do not fit.
     """
     w, b = (
         _array(f"{name} {part}", value, np.float32)

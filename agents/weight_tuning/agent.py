@@ -7,19 +7,16 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.base import Action, DrivingTask, observation_rows
+from agents.base import CHECKPOINTS, Action, DrivingTask, check_compatible, observation_rows
 from agents.delay import NearFuture, moved_plan
-from agents.made_for import check_task
 from agents.nmpc import qp as program
 from agents.nmpc.rti_agent import RtiNmpc
 from agents.nmpc.rti_solver import DAMPING
 from agents.reference import NODE
-from agents.registry import CHECKPOINTS
 from agents.weight_tuning.deciding import NOBODY, Decider
 from agents.weight_tuning.deciding_rows import finish_rows, prepare_rows
-from agents.weight_tuning.files import load
 from agents.weight_tuning.loop_memory import LoopMemory, LoopRow
-from agents.weight_tuning.policy import WeightPolicy
+from agents.weight_tuning.policy import WeightPolicy, load
 from agents.weight_tuning.watching import REJECTED
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.vehicle import VehicleParameters
@@ -86,7 +83,7 @@ class TunedNmpc:
         policy = self.weights if isinstance(self.weights, WeightPolicy) else None
         if policy is not None:
             named = weights if isinstance(weights, str | Path) else repr(policy.algorithm)
-            check_task(f"policy of weights {named}", policy, task, stacklevel=4)
+            check_compatible(f"policy of weights {named}", policy, task, stacklevel=4)
         self.nmpc = RtiNmpc(
             task,
             horizon=horizon,

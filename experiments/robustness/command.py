@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
-from agents.weight_tuning.files import load
+from agents.weight_tuning.policy import load
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
 from experiments.robustness.summary import summary, table, widest_kept
 from experiments.robustness.switching import BATCH, WHOLE, WINDOW, Setup, arms_of, drive_arm

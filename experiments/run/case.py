@@ -17,7 +17,8 @@ import numpy as np
 import agents
 import lpv_track_env
 import trajectories
-from agents.registry import CHECKPOINTS, check_settings, source_file
+from agents.base import CHECKPOINTS
+from agents.registry import check_settings, source_file
 from experiments.run import learning_cost, metrics
 from experiments.run.computing import ComputingTimes
 from experiments.run.rollout import Rollout, rollout

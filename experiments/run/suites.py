@@ -158,7 +158,7 @@ def _near_sighted(name: str) -> bool:
     """Whether an agent is a policy file that was made for another preview than `RAW_PREVIEW`."""
     if not name.endswith(".json"):
         return False
-    from agents.learned.files import read
+    from agents.learned.policy import read
 
     layout = read(name).layout
     return {key: getattr(layout, key) for key in RAW_PREVIEW} != RAW_PREVIEW

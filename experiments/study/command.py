@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from agents.weight_tuning.files import load
+from agents.weight_tuning.policy import load
 from agents.weights import WeightSchedule
 from experiments.run.benchmark import progress_bar
 from experiments.study import oracle

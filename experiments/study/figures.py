@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.weight_tuning.files import load
+from agents.weight_tuning.policy import load
 from agents.weights import TrackingWeights
 from experiments.report.charts import Chart
 from experiments.report.estimate_figures import upright

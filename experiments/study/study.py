@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.weight_tuning.files import load
+from agents.weight_tuning.policy import load
 from experiments.run.engines import local_pool
 from experiments.study.evaluation import FIGURES, EvaluationSet, Judge
 from experiments.study.ladder import EVERY, Rung, rung

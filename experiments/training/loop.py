@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from stable_baselines3.common.logger import Logger, configure
 
-from agents.learned.files import read as read_policy
-from agents.learned.files import write as write_policy
+from agents.learned.policy import read as read_policy
+from agents.learned.policy import write as write_policy
 from experiments.run.process import Interrupts
 from experiments.run.provenance import hardware, revision, versions
 from experiments.training import checkpoint

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agents.weight_tuning.files import write as write_policy
+from agents.weight_tuning.policy import write as write_policy
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments.run.process import Interrupts
 from experiments.run.provenance import hardware, revision, versions

@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from agents.weight_tuning.closed_loop import ClosedLoop, Tally
-from agents.weight_tuning.files import load
-from agents.weight_tuning.policy import WeightPolicy
+from agents.weight_tuning.policy import WeightPolicy, load
 from agents.weights import WeightSchedule
 from experiments import cli
 

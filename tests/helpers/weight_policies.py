@@ -11,8 +11,7 @@ import pytest
 
 from agents.weight_tuning.choice import DIRECTIONS, WeightChoice
 from agents.weight_tuning.features import size
-from agents.weight_tuning.files import read, write
-from agents.weight_tuning.policy import WeightPolicy
+from agents.weight_tuning.policy import WeightPolicy, read, write
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import ObservationLayout
 from trajectories import CurvatureBands

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from agents.weight_tuning.files import load, read
+from agents.weight_tuning.policy import load, read
 from tests.helpers.learned_policies import change, put_weights
 from tests.helpers.weight_policies import checked, random_weight_policy, refusal, same, written
 
@@ -253,7 +253,7 @@ def test_a_pickle_in_place_of_the_spec_is_not_run(file: Path, tmp_path: Path) ->
 def test_reading_unpickles_nothing_and_loads_no_torch(file: Path) -> None:
     code = (
         "import sys\n"
-        "from agents.weight_tuning.files import load\n"
+        "from agents.weight_tuning.policy import load\n"
         "found = []\n"
         "sys.addaudithook(lambda event, _: found.append(event) if 'pickle' in event else None)\n"
         f"load({str(file)!r})\n"

@@ -16,7 +16,7 @@ from agents.learned import container
 from agents.weight_tuning import files
 from agents.weight_tuning.choice import LONGEST_WINDOW, WeightChoice
 from agents.weight_tuning.features import names
-from agents.weight_tuning.files import load, read, write
+from agents.weight_tuning.policy import load, read, write
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import ObservationLayout
 from tests.helpers.learned_policies import change, put_weights, random_policy

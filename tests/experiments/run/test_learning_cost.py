@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from agents.learned.files import write
-from agents.learned.policy import Policy
+from agents.learned.policy import Policy, write
 from experiments.run import learning_cost, metrics, tables
 from experiments.run.case import run_case
 from experiments.run.learning_words import count, duration, words

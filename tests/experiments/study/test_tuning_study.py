@@ -14,8 +14,7 @@ pytest.importorskip("cma")
 import agents
 import trajectories
 from agents.weight_tuning.choice import WeightChoice
-from agents.weight_tuning.files import load
-from agents.weight_tuning.policy import WeightPolicy
+from agents.weight_tuning.policy import WeightPolicy, load
 from agents.weight_tuning.score import FAILED, PARTS
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments.cli import parser

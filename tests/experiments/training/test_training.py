@@ -14,7 +14,7 @@ pytest.importorskip("stable_baselines3")
 import torch
 from stable_baselines3.common.logger import Logger
 
-from agents.learned.files import read as read_policy
+from agents.learned.policy import read as read_policy
 from experiments import cli
 from experiments.run.case import run_case
 from experiments.run.suites import HELD_OUT, SIX

@@ -24,8 +24,7 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("cma")
 
 from agents.weight_tuning.choice import SLEW
-from agents.weight_tuning.files import load
-from agents.weight_tuning.policy import WeightPolicy
+from agents.weight_tuning.policy import WeightPolicy, load
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments import cli
 from experiments.run.provenance import revision, versions
