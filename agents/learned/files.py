@@ -1,9 +1,9 @@
 """Files of policies: NAME.json describes a policy, NAME.safetensors has its network's numbers.
 
 This is the common core; `Kind` says how the files of one kind of policy differ. Reading executes
-nothing: the files hold JSON and plain numbers, and nothing is unpickled. NAME.json contains a digest
-of itself and one of the weights, so a damaged or edited file is refused. The digests find accidents;
-they do not stop somebody from writing another policy, which can at worst drive badly.
+nothing: the files hold JSON and plain numbers, nothing is unpickled. NAME.json contains a digest of
+itself and one of the weights, so damaged or edited files are refused. The digests find accidents.
+They do not keep anybody from writing another policy, but the worst it can do is to drive badly.
 """
 
 import hashlib

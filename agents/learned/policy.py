@@ -334,7 +334,8 @@ def checked_layers(
     for k, pair in enumerate(layers):
         if not isinstance(pair, tuple | list) or len(pair) != 2:
             raise ValueError(f"layers[{k}] must be a weight and a bias")
-        checked.append(checked_layer(f"layers[{k}]", *pair, inputs))
+        weight, bias = pair
+        checked.append(checked_layer(f"layers[{k}]", weight, bias, inputs))
         inputs = len(checked[-1][1])
     if inputs != outputs:
         raise ValueError(f"the last layer must have {outputs} outputs, {meaning}, not {inputs}")

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.learned.policy import Activation, Layer, Origin, Policy, Squash
+from agents.learned.files import Layer
+from agents.learned.policy import Activation, Origin, Policy, Squash
 from lpv_track_env.observation import ObservationLayout
 from trajectories.naming import choose
 

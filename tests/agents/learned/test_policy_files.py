@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from safetensors.numpy import save
 
 from agents.learned import files, read, write
+from agents.learned import policy as policies
 from lpv_track_env import observation
 from lpv_track_env.observation import ObservationLayout
 from tests.helpers.learned_policies import (
@@ -291,8 +292,12 @@ def test_a_number_beyond_floats_is_refused(file: Path) -> None:
 
 
 def tensors(**changes: Any) -> dict[str, Any]:
-    found: dict[str, Any] = dict(files._tensors(POLICY))
-    found.update(changes)
+    found: dict[str, Any] = {
+        "features.weight": POLICY.feature_weight,
+        "features.bias": POLICY.feature_bias,
+        **files.layer_tensors(POLICY.layers),
+        **changes,
+    }
     return {name: value for name, value in found.items() if value is not None}
 
 
@@ -369,6 +374,6 @@ def test_what_to_give_instead(name: str, reason: str, file: Path) -> None:
 def test_another_versions_entries_are_named(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scalars = (*observation.SCALARS[:-1], ("reference_speed", "km/h", 100.0))
     monkeypatch.setattr(observation, "SCALARS", scalars)
-    monkeypatch.setattr(files, "SCALARS", scalars)
+    monkeypatch.setattr(policies, "SCALARS", scalars)
     said = refusal(file)
     assert "['reference_speed', 'm/s'] then, ['reference_speed', 'km/h'] now): retrain it" in said

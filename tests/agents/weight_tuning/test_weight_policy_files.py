@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from agents.learned import container
-from agents.weight_tuning import files
+from agents.learned import files as core
+from agents.weight_tuning import policy as files
 from agents.weight_tuning.choice import LONGEST_WINDOW, WeightChoice
 from agents.weight_tuning.features import names
 from agents.weight_tuning.policy import load, read, write
@@ -103,7 +103,7 @@ def test_weights_are_there_before_a_spec_names_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     order: list[str] = []
-    monkeypatch.setattr(files, "write_atomically", lambda file, _: order.append(file.suffix))
+    monkeypatch.setattr(core, "write_atomically", lambda file, _: order.append(file.suffix))
     write(POLICY, tmp_path / "mine.json")
     assert order == [".safetensors", ".json"]
 
@@ -284,7 +284,7 @@ def test_what_is_no_finite_number_is_refused(key: str, value: str, file: Path) -
 
 
 def tensors(**changes: Any) -> dict[str, Any]:
-    found: dict[str, Any] = {**container.layer_tensors(POLICY.layers), **changes}
+    found: dict[str, Any] = {**core.layer_tensors(POLICY.layers), **changes}
     return {name: value for name, value in found.items() if value is not None}
 
 
@@ -328,7 +328,7 @@ def test_weights_are_parsed_only_if_they_are_those_that_were_written(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parsed: list[bytes] = []
-    monkeypatch.setattr(container.safetensors, "deserialize", parsed.append)
+    monkeypatch.setattr(core.safetensors, "deserialize", parsed.append)
     beside = file.with_suffix(".safetensors")
     content = bytearray(beside.read_bytes())
     content[-1] ^= 1
