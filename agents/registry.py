@@ -111,6 +111,24 @@ def source_file(name: str) -> Path | None:
     return Path(spec.origin) if spec is not None and spec.origin is not None else None
 
 
+def parameters_of(name: str) -> dict[str, inspect.Parameter] | None:
+    """Return an agent's settings by name, or None where its class takes any or does not tell.
+
+    Raises
+    ------
+    ValueError
+        For an unknown agent.
+    """
+    cls = agent_class(name)
+    try:
+        parameters = list(inspect.signature(cls).parameters.values())[1:]
+    except (TypeError, ValueError):  # not a class, or one without a signature
+        return None
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return None
+    return {parameter.name: parameter for parameter in parameters}
+
+
 def check_settings(name: str, settings: Iterable[str]) -> None:
     """Check the names of settings for one agent.
 
@@ -119,14 +137,9 @@ def check_settings(name: str, settings: Iterable[str]) -> None:
     ValueError
         For an unknown one, listing the agent's settings and the nearest.
     """
-    cls = agent_class(name)
-    try:
-        parameters = list(inspect.signature(cls).parameters.values())[1:]
-    except (TypeError, ValueError):  # not a class, or one without a signature
+    known = parameters_of(name)
+    if known is None:
         return
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-        return
-    known = [parameter.name for parameter in parameters]
     for key in settings:
         if key not in (*known, *COMMON):
             hint = f"; {suggestion(key, known)}" if known else ""

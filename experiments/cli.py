@@ -79,9 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Before any numerical library is imported.
     one_thread()
     given = sys.argv[1:] if arguments is None else arguments
-    options = parser(given[:1]).parse_args(given)
     try:
-        return run(options)
+        return run(parser(given[:1]).parse_args(given))
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print("lpv-track:", " ".join(str(error).split()), file=sys.stderr)
         return EXIT_USAGE

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -80,10 +79,9 @@ class Drive:
 
 
 def drive(
-    case: Case | TrafficDrive,
+    cases: Sequence[Case | TrafficDrive],
     console: Console,
     *,
-    names: Sequence[str] = (),
     frames: Path | None = None,
     every: int = 1,
     video: Path | None = None,
@@ -91,17 +89,17 @@ def drive(
     speed_up: float = 1.0,
     colour: str = "speed",
 ) -> int:
-    """Drive a case and show it, or write frames or a video; 0 if every agent has finished.
+    """Drive cases side by side and show them, or write frames or a video.
+
+    Returns 0 if every agent has finished, else 1.
 
     Parameters
     ----------
-    case
-        What is driven.
+    cases
+        One case, or several of one control period; an agent that ends before the others stays in
+        the picture.
     console
-        Where the outcome and, on a terminal, the progress are told.
-    names
-        Agents that drive the case side by side; empty: the case's own. Who ends before the others
-        stays in the picture.
+        Receives the outcome and, on a terminal, the progress.
     frames, every
         Folder of PNG files, one every so many steps.
     video, fps, speed_up
@@ -119,8 +117,7 @@ def drive(
     ModuleNotFoundError
         In one line that names the extra to install, for a video without an encoder.
     """
-    sink = _sink(case.control_period, frames, every, video, fps, speed_up)
-    cases = [replace(case, agent=name) for name in names or (case.agent,)]
+    sink = _sink(cases[0].control_period, frames, every, video, fps, speed_up)
     for one in cases:
         one.check()
     with ExitStack() as stack:

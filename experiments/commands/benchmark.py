@@ -6,11 +6,17 @@ from typing import Any
 from rich.console import Console
 
 from experiments.commands.options import (
+    add_agent_settings,
+    add_agents,
     add_conditions,
     add_out,
     add_seeds,
     add_settings,
+    add_speed_modes,
+    add_trajectories,
+    add_vehicles,
     add_workers,
+    agent_settings,
     conditions_of,
     parse_settings,
     resumable,
@@ -27,17 +33,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default="paper",
         help="paper (default), quick, realtime, learned, plants, converged, sideslip or frozen",
     )
-    parser.add_argument(
-        "--agents",
-        nargs="+",
-        metavar="NAME",
-        help="default: all; your own: file.py:Class, policy.json",
-    )
-    parser.add_argument(
-        "--trajectories", nargs="+", metavar="NAME", help="instead of a suite's: names or files"
-    )
-    parser.add_argument("--vehicles", nargs="+", metavar="NAME", help="presets or .json files")
-    parser.add_argument("--speed-modes", nargs="+", choices=["variable", "fixed"])
+    add_agents(parser, "default: all; your own: file.py:Class, policy.json")
+    add_trajectories(parser, None, "instead of a suite's: names or files")
+    add_vehicles(parser, None, "presets or .json files")
+    add_speed_modes(parser, None)
     add_conditions(
         parser,
         None,
@@ -47,7 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_seeds(parser, 1, "seeds 0..N-1 (default 1)")
     parser.add_argument("--control-period", type=float, metavar="S", help="s (default 0.05)")
     add_settings(parser, "--env", "environment settings, e.g. initial_error_range=[0.3,0.1,0.5]")
-    add_settings(parser, "--agent-set", "settings of every agent")
+    add_agent_settings(parser)
     add_settings(
         parser, "--vehicle-set", "vehicle fields to change, e.g. max_lateral_velocity_ratio=0.5"
     )
@@ -80,15 +79,20 @@ def run(options: argparse.Namespace, console: Console) -> int:
         specs = suites.SUITES[suite](names, list(seeds))
     common = {
         "env_settings": parse_settings(options.env),
-        "agent_settings": parse_settings(options.agent_set),
         "vehicle_changes": parse_settings(options.vehicle_set),
     }
     if options.control_period is not None:
         common["control_period"] = options.control_period
     if options.conditions is not None or options.conditions_set:
         specs = [{**spec, "conditions": conditions_of(options)} for spec in specs]
-    specs = distinct([merged(spec, common) for spec in specs])
-    settings = {"suite": suite, "agents": names, "seeds": list(seeds), **common}
+    own = agent_settings(options.agent_set, [spec["agent"] for spec in specs])
+    specs = distinct(
+        [merged(spec, {**common, "agent_settings": own[spec["agent"]]}) for spec in specs]
+    )
+    settings = {
+        "suite": suite, "agents": names, "seeds": list(seeds), **common,
+        "agent_settings": parse_settings(options.agent_set),
+    }  # fmt: skip
     with resumable(options, console, "the same command with --resume"):
         store = run_benchmark(
             specs, options.out, workers=options.workers, settings=settings,
@@ -97,7 +101,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     return finish(store, specs, console)
 
 
-def merged(spec: dict[str, object], changes: dict[str, Any]) -> dict[str, object]:
+def merged(spec: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """Return a spec with changes: mappings are merged, other values replaced."""
     result = dict(spec)
     for key, value in changes.items():

@@ -6,11 +6,17 @@ from pathlib import Path
 from rich.console import Console
 
 from experiments.commands.options import (
+    add_agent_settings,
+    add_agents,
     add_conditions,
     add_seed,
     add_settings,
-    add_vehicle,
+    add_speed_modes,
+    add_trajectories,
+    add_vehicles,
+    agent_settings,
     conditions_of,
+    only_one,
     parse_settings,
 )
 
@@ -19,16 +25,13 @@ EXAMPLE = "lpv-track drive --agents lpv-nmpc pure-pursuit --trajectory T2 --vide
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("--agent", metavar="NAME", help="default: lpv-nmpc")
-    parser.add_argument(
-        "--agents", nargs="+", metavar="NAME", help="drive the same case, side by side"
-    )
-    parser.add_argument("--trajectory", default="T2", metavar="NAME")
-    add_vehicle(parser)
-    parser.add_argument("--speed-mode", default="variable", choices=["variable", "fixed"])
+    add_agents(parser, "default: lpv-nmpc; several drive the same case, side by side")
+    add_trajectories(parser, ["T2"])
+    add_vehicles(parser, ["m2-minibus"])
+    add_speed_modes(parser, ["variable"])
     add_conditions(parser)
     add_seed(parser)
-    add_settings(parser, "--agent-set")
+    add_agent_settings(parser)
     add_settings(parser, "--env")
     parser.add_argument(
         "--frames", type=Path, metavar="DIR", help="write PNG frames, open no window"
@@ -57,20 +60,22 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from experiments.drive import drive
     from experiments.run.case import Case
 
-    if options.agent is not None and options.agents:
-        raise ValueError("give --agent or --agents, not both")
-    names = options.agents or [options.agent or "lpv-nmpc"]
-    case = Case(
-        agent=names[0],
-        trajectory=options.trajectory,
-        vehicle=options.vehicle,
-        speed_mode=options.speed_mode,
-        conditions=conditions_of(options),
-        seed=options.seed,
-        agent_settings=parse_settings(options.agent_set),
-        env_settings=parse_settings(options.env),
-    )
+    names = options.agents or ["lpv-nmpc"]
+    settings = agent_settings(options.agent_set, names)
+    cases = [
+        Case(
+            agent=name,
+            trajectory=only_one("trajectory", options.trajectories),
+            vehicle=only_one("vehicle", options.vehicles),
+            speed_mode=only_one("speed mode", options.speed_modes),
+            conditions=conditions_of(options),
+            seed=options.seed,
+            agent_settings=settings[name],
+            env_settings=parse_settings(options.env),
+        )
+        for name in names
+    ]
     return drive(
-        case, console, names=names, frames=options.frames, every=options.every,
-        video=options.video, fps=options.fps, speed_up=options.speed_up, colour=options.colour,
+        cases, console, frames=options.frames, every=options.every, video=options.video,
+        fps=options.fps, speed_up=options.speed_up, colour=options.colour,
     )  # fmt: skip

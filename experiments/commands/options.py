@@ -3,7 +3,7 @@
 import argparse
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
@@ -96,6 +96,120 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
         except ValueError:
             settings[key] = value
     return settings
+
+
+def add_agents(parser: argparse.ArgumentParser, meaning: str) -> None:
+    """Add `--agents` alias `--agent`, one name or several."""
+    _add_names(parser, "--agents", "--agent", help=meaning)
+
+
+def add_trajectories(
+    parser: argparse.ArgumentParser, default: list[str] | None, meaning: str | None = None
+) -> None:
+    """Add `--trajectories` alias `--trajectory`, one name or several."""
+    _add_names(parser, "--trajectories", "--trajectory", default=default, help=meaning)
+
+
+def add_vehicles(
+    parser: argparse.ArgumentParser, default: list[str] | None, meaning: str | None = None
+) -> None:
+    """Add `--vehicles` alias `--vehicle`, one name or several."""
+    _add_names(parser, "--vehicles", "--vehicle", default=default, help=meaning)
+
+
+def add_speed_modes(parser: argparse.ArgumentParser, default: list[str] | None) -> None:
+    """Add `--speed-modes` alias `--speed-mode`, one mode or both."""
+    choices = ["variable", "fixed"]
+    _add_names(parser, "--speed-modes", "--speed-mode", default=default, choices=choices)
+
+
+def _add_names(parser: argparse.ArgumentParser, *names: str, **more: Any) -> None:
+    metavar = None if "choices" in more else "NAME"
+    parser.add_argument(*names, nargs="+", metavar=metavar, action=_OneSpelling, **more)
+
+
+class _OneSpelling(argparse.Action):
+    """Store the values; refuse an option that is given under both of its names."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,  # noqa: ARG002
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        seen = f"_spelling_of_{self.dest}"
+        if getattr(namespace, seen, option_string) != option_string:
+            raise ValueError(f"give {self.option_strings[1]} or {self.option_strings[0]}, not both")
+        setattr(namespace, seen, option_string)
+        setattr(namespace, self.dest, values)
+
+
+def only_one(kind: str, names: Sequence[str]) -> str:
+    """Return the one name that was given.
+
+    Raises
+    ------
+    ValueError
+        If there are several.
+    """
+    if len(names) > 1:
+        raise ValueError(f"one {kind} is driven at a time, not {' '.join(names)}")
+    return names[0]
+
+
+def add_agent_settings(parser: argparse.ArgumentParser) -> None:
+    """Add `--agent-set`; `agent_settings` reads it."""
+    parser.add_argument(
+        "--agent-set", nargs="+", default=[], metavar="[NAME:]KEY=VALUE",
+        help="settings of every agent, or of the agent NAME alone, e.g. "
+        'lpv-nmpc:weights={"Q":[1,1,20,20]}',
+    )  # fmt: skip
+
+
+def agent_settings(pairs: Sequence[str], agents: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Return the settings of each agent from `--agent-set`.
+
+    KEY=VALUE sets every agent, NAME:KEY=VALUE the agent NAME alone, whatever the former says.
+
+    Raises
+    ------
+    ValueError
+        For a NAME that is not among the agents; a setting that an agent does not know; and one that
+        is to hold for all agents although their defaults for it differ, such as the weights of
+        `lpv-nmpc` and `lpv-nmpc-tuned`: it would turn one agent into another.
+    """
+    from agents.registry import check_settings, parameters_of
+    from trajectories.naming import choose
+
+    names = tuple(dict.fromkeys(agents))
+    common: dict[str, Any] = {}
+    own: dict[str, dict[str, Any]] = {name: {} for name in names}
+    for key, value in parse_settings(pairs).items():
+        name, separator, setting = key.rpartition(":")
+        if separator:
+            own[choose("agent in --agent-set", name, names)][setting] = value
+        else:
+            common[key] = value
+    for key in common:
+        defaults = {
+            name: repr(known[key].default)
+            for name in names
+            if key not in own[name] and key in (known := parameters_of(name) or {})
+        }
+        if len(set(defaults.values())) > 1:
+            raise ValueError(
+                f"setting {key!r} has different defaults for {', '.join(defaults)}: say whose it "
+                f"is, as --agent-set {next(iter(defaults))}:{key}=..."
+            )
+    for name in names:
+        try:
+            check_settings(name, {**common, **own[name]})
+        except ValueError as error:
+            if not common or len(names) == 1:
+                raise
+            raise ValueError(f"{error}; --agent-set NAME:KEY=VALUE sets one agent alone") from None
+    return {name: {**common, **own[name]} for name in names}
 
 
 def conditions_of(options: argparse.Namespace) -> str | dict[str, Any]:

@@ -4,7 +4,7 @@ import argparse
 
 from rich.console import Console
 
-from experiments.commands.options import conditions_of, parse_settings
+from experiments.commands.options import agent_settings, conditions_of
 from experiments.parallel.options import SETTINGS
 from experiments.parallel.options import add_parallel_options as add_options
 
@@ -23,6 +23,6 @@ def run(options: argparse.Namespace, console: Console) -> int:
     setup = Setup(
         **{name: getattr(options, name) for name in SETTINGS},
         conditions=conditions_of(options),
-        agent_settings=parse_settings(options.agent_set),
+        agent_settings=agent_settings(options.agent_set, [options.agent])[options.agent],
     )
     return command.run_parallel(setup, options.out, console)

@@ -63,11 +63,10 @@ def run_highway(options: argparse.Namespace, console: Console) -> int:
     if options.video is not None or options.frames is not None:
         from experiments.drive import drive
 
-        first = next(one for one in drives if one.seed == options.seeds - 1)
-        shown = [name for name in options.agents if name not in OWN]
+        last = [one for one in drives if one.seed == options.seeds - 1]
         return drive(
-            first, console, names=shown, video=options.video, frames=options.frames,
-            every=options.every,
+            [one for one in last if one.agent not in OWN] or last[:1], console,
+            video=options.video, frames=options.frames, every=options.every,
         )  # fmt: skip
     # What cannot be made is told once, before anything is driven.
     drives[0].make_env().close()

@@ -99,7 +99,7 @@ def _words(spec: str) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print how two folders differ; return 0 if they do not, 1 if they do, 2 if one has no results."""
+    """Print the differences; return 0 if there are none, 1 if there are, 2 without results."""
     parser = argparse.ArgumentParser(
         prog="python -m experiments.run.compare", description=__doc__,
         epilog=f"example: {EXAMPLE}", formatter_class=argparse.RawDescriptionHelpFormatter,

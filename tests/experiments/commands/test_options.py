@@ -1,0 +1,103 @@
+"""Options that commands share: settings of one agent or all, names in both numbers."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments.cli import main, parser
+from experiments.commands.options import agent_settings
+from experiments.run import tables
+from experiments.run.store import ResultStore
+
+WEIGHTS = {"Q": [1, 1, 20, 20], "S": [5, 5, 100, 100], "R": [0.01, 1]}
+
+
+def test_a_plain_setting_is_every_agents() -> None:
+    found = agent_settings(["curvature_window=2"], ["stanley", "pid", "stanley"])
+    assert found == {"stanley": {"curvature_window": 2}, "pid": {"curvature_window": 2}}
+
+
+def test_a_setting_with_a_name_is_that_agents_alone() -> None:
+    pairs = [f"lpv-nmpc:weights={json.dumps(WEIGHTS)}", "max_failures=3", "stanley:gain=2"]
+    with pytest.raises(ValueError, match=r"'stanley' has no setting 'max_failures'.*NAME:KEY="):
+        agent_settings(pairs, ["lpv-nmpc", "lpv-nmpc-tuned", "stanley"])
+    pairs[1] = "lpv-nmpc-tuned:max_failures=3"
+    assert agent_settings(pairs, ["lpv-nmpc", "lpv-nmpc-tuned", "stanley"]) == {
+        "lpv-nmpc": {"weights": WEIGHTS},
+        "lpv-nmpc-tuned": {"max_failures": 3},
+        "stanley": {"gain": 2},
+    }
+
+
+def test_a_setting_with_a_name_goes_before_a_plain_one() -> None:
+    found = agent_settings(["pid:curvature_window=3", "curvature_window=2"], ["stanley", "pid"])
+    assert found == {"stanley": {"curvature_window": 2}, "pid": {"curvature_window": 3}}
+
+
+def test_a_name_may_be_a_class_of_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("from agents.classical.geometric import Stanley as Mine\n")
+    name = f"{file}:Mine"
+    assert agent_settings([f"{name}:gain=2"], [name, "pid"]) == {name: {"gain": 2}, "pid": {}}
+
+
+def test_an_unknown_name_is_told_with_the_nearest() -> None:
+    with pytest.raises(ValueError, match=r"unknown agent .*'stanly'.*nearest: stanley"):
+        agent_settings(["stanly:gain=2"], ["lpv-nmpc", "stanley"])
+
+
+@pytest.mark.parametrize(
+    ("setting", "agents"),
+    [("weights", ["lpv-nmpc", "lpv-nmpc-tuned"]), ("policy", ["ppo", "sac", "lpv-nmpc"])],
+)
+def test_what_tells_two_agents_apart_is_not_set_for_both(setting: str, agents: list[str]) -> None:
+    """Such as the weights of lpv-nmpc and lpv-nmpc-tuned: two rows of one agent would come out."""
+    both = ", ".join(agents[:2])
+    with pytest.raises(
+        ValueError, match=rf"'{setting}' has different defaults for {both}:"
+    ) as told:
+        agent_settings([f"{setting}=x.json"], agents)
+    assert f"--agent-set {agents[0]}:{setting}=..." in str(told.value)
+    assert agent_settings([f"{agents[0]}:{setting}=x.json"], agents)[agents[1]] == {}
+
+
+@pytest.mark.parametrize("command", ["benchmark", "drive"])
+@pytest.mark.parametrize(
+    ("plural", "singular", "value"),
+    [
+        ("agents", "agent", "pid"),
+        ("trajectories", "trajectory", "T4"),
+        ("vehicles", "vehicle", "course-car"),
+        ("speed_modes", "speed_mode", "fixed"),
+    ],
+)
+def test_names_are_given_in_either_number(
+    command: str, plural: str, singular: str, value: str
+) -> None:
+    for name in (plural, singular):
+        options = parser([command]).parse_args([command, f"--{name.replace('_', '-')}", value])
+        assert getattr(options, plural) == [value]
+
+
+def test_rows_of_one_agent_with_other_settings_are_told_apart(tmp_path: Path) -> None:
+    command = [
+        "benchmark",
+        "--agents",
+        "pid",
+        "stanley",
+        "--trajectory",
+        "u-turn",
+        "--workers",
+        "1",
+    ]
+    out = ["--out", str(tmp_path / "out")]
+    assert main([*command, *out]) == 0
+    assert main([*command, *out, "--agent-set", "stanley:gain=2.5", "--resume"]) == 0
+    cases = ResultStore(tmp_path / "out").cases()
+    assert tables.labels(cases) == ["stanley", "stanley (gain=2.5)", "pid"]
+    rows = [row for row in tables.build_rows(cases) if not row.published]
+    assert [(row.label, row.runs) for row in rows] == [
+        ("stanley", 1), ("stanley (gain=2.5)", 1), ("pid", 1),
+    ]  # fmt: skip
+    assert rows[0].values["ale"] != rows[1].values["ale"]
