@@ -1,28 +1,21 @@
-"""`report.html` from a results folder alone: nothing is driven again, nothing is fetched."""
+"""Build `report.html` from a results folder: nothing is simulated again, nothing is fetched."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from experiments.report import replay
-from experiments.report.comparison import comparison_section
-from experiments.report.computing import computing_section
-from experiments.report.curvature import curvature_section
-from experiments.report.document import Document
-from experiments.report.drives import drives_of, in_families
-from experiments.report.failures import failures_section
-from experiments.report.learning import learning_section
-from experiments.report.page import render_page
-from experiments.report.provenance import errata_section, manifest_section
+from experiments.report.appendix import errata_section, manifest_section
+from experiments.report.comparison import comparison_section, curvature_section
+from experiments.report.computing import computing_section, learning_section
+from experiments.report.drives import Result, drives_of, in_families
+from experiments.report.page import Document, line_styles
 from experiments.report.sideslip import sideslip_section
-from experiments.report.styles import line_styles
-from experiments.report.summary import summary_section
+from experiments.report.summary import failures_section, summary_section
 from experiments.report.tracking import figure_sections
 from experiments.run import tables
 from experiments.run.store import ResultStore
 from trajectories.fileio import write_atomically
-
-Result = Mapping[str, Any]
 
 
 def write_report(folder: Path) -> Path:
@@ -46,13 +39,14 @@ def write_report(folder: Path) -> Path:
 
 
 def where(report: Path) -> str:
-    """A line for a terminal: where the report is, and how large."""
+    """Return a line for a terminal: path and size of the report."""
     return f"report: {report} ({report.stat().st_size / 1e6:.1f} MB)"
 
 
 def build(cases: Sequence[Result], store: ResultStore) -> str:
-    """The page as text."""
+    """Return the page as text."""
     kept = in_families(tables.ordered(tables.current(cases)))
+    rows = tables.build_rows(kept)
     manifest = store.manifest()
     drives, missing = drives_of(kept, store)
     styles = line_styles(tables.labels(kept))
@@ -60,7 +54,7 @@ def build(cases: Sequence[Result], store: ResultStore) -> str:
     document.section("Summary", summary_section(document, kept, len(cases) - len(kept)))
     figure_sections(document, drives, missing, styles)
     document.section("Replay", replay.replay_section(drives), printed=False)
-    document.section("Against the published table", comparison_section(document, kept))
+    document.section("Against the published table", comparison_section(document, kept, rows))
     document.section("By curvature", curvature_section(document, kept, styles))
     document.section("Computing time", computing_section(document, drives, styles))
     document.section("Failures and warnings", failures_section(document, kept))
@@ -71,17 +65,12 @@ def build(cases: Sequence[Result], store: ResultStore) -> str:
     document.section("What learning cost", learning_section(document, kept))
     document.section("Errata of the paper", errata_section())
     document.section("Settings and provenance", manifest_section(document, manifest, kept))
-    return render_page(
-        title="Path tracking benchmark",
-        subtitle=subtitle(manifest),
-        contents=document.contents,
-        body=document.body,
-        scripts=(replay.SCRIPT,) if drives else (),
-    )
+    scripts = (replay.SCRIPT,) if drives else ()
+    return document.render("Path tracking benchmark", subtitle(manifest), scripts)
 
 
 def subtitle(manifest: Mapping[str, Any]) -> str:
-    """When and from which revision, as far as the manifest tells."""
+    """Return date and revision of the results, as far as the manifest has them."""
     parts = ["LPV-NMPC after kumar2025lpv and other agents on lpv-track-env"]
     if written := manifest.get("written"):
         parts.append(str(written))

@@ -1,77 +1,90 @@
-"""Section that holds results against the published table: figures, and tables of every setting."""
+"""Sections that compare agents: with the published table, and by the path's curvature."""
 
-from collections.abc import Callable, Sequence
+import html
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
-from experiments.report.document import Document, first_open, folded, joined, paragraph
-from experiments.report.drives import family_of, main_family
-from experiments.report.estimate_figures import Measured, by_agent
-from experiments.report.html_tables import html_rows, trained_words
-from experiments.report.learning import TRAINED_NOTE
-from experiments.report.styles import legend
-from experiments.report.tracking import condition_styles
-from experiments.run import tables
-from experiments.run.tables import (
-    EFFORT,
-    FURTHER,
-    PUBLISHED_NOTE,
-    TRACKING,
-    Result,
-    Row,
-    build_rows,
+from experiments.report.charts import BOTTOM, TOP, Chart, Scale, decades
+from experiments.report.computing import TRAINED_NOTE
+from experiments.report.drives import Result, family_of, main_family, per_setting
+from experiments.report.page import (
+    Document,
+    Panel,
+    Styles,
+    folded,
+    joined,
+    legend,
+    paragraph,
 )
+from experiments.report.tracking import condition_styles
+from experiments.run import published, tables
+from experiments.run.band_metrics import BANDS
+from experiments.run.curvature_table import NOTE, Line, band_lines, band_ranges
+from experiments.run.tables import EFFORT, FURTHER, TRACKING, Column, Estimate, Row
 
 ERRORS = (
     ("ale", "ALE (m)", "Average lateral error"),
     ("aoe", "AOE (rad)", "Average orientation error"),
 )
+FLOOR = 1e-5
+"""Smallest error that a logarithmic axis shows, m."""
+CHARACTER = 5.6
+"""Width of a character of an axis label, in units of a chart."""
+LONGEST_LABEL = 22
 
 
-def comparison_section(document: Document, cases: Sequence[Result]) -> str:
-    """Errors by agent as figures of the first family, then the tables of every setting."""
+def comparison_section(document: Document, cases: Sequence[Result], rows: Sequence[Row]) -> str:
+    """Return errors by agent as figures of the first family, then the tables of every setting."""
     parts = [
         paragraph(
-            f"{PUBLISHED_NOTE} Max CTE and MLE, by formula the same, use the foot point on "
+            f"{tables.PUBLISHED_NOTE} Max CTE and MLE, by formula the same, use the foot point on "
             "the path. Several seeds (×n): mean ± 95 % interval by the t-distribution."
         )
     ]
     if any(case.get("training") for case in cases):
         parts.append(paragraph(TRAINED_NOTE))
-    parts += _figures(document, cases)
-    rows = tables.by_setting(build_rows(cases))
-    family = main_family(cases)
-    shown = [
-        (family_of(group[0]) == family, joined(_tables(document, setting, rows[setting])))
-        for setting, group in tables.cases_by_setting(cases).items()
-    ]
-    parts.append(first_open(shown, "Other settings"))
+    parts += _agent_figures(document, cases, rows)
+    of_setting = tables.by_setting(rows)
+    parts.append(
+        per_setting(cases, lambda setting, _: _tables(document, setting, of_setting[setting]))
+    )
     return joined(parts)
 
 
-def _figures(document: Document, cases: Sequence[Result]) -> list[str]:
+@dataclass(frozen=True)
+class Measured:
+    """An estimate of one agent on one trajectory under one kind of conditions."""
+
+    trajectory: str
+    label: str
+    conditions: str
+    value: Estimate
+
+
+def _agent_figures(document: Document, cases: Sequence[Result], rows: Sequence[Row]) -> list[str]:
     done = [case for case in cases if case.get("status") == "ok"]
     if not done:
         return []
     family = main_family(done)
-    own = [case for case in done if family_of(case) == family]
-    words = {
+    conditions = {
         tables.setting_of(case): tables.conditions_words(case.get("conditions", "simulation"))
-        for case in own
+        for case in done
+        if family_of(case) == family
     }
-    rows = [row for row in build_rows(own) if not row.published]
-    styles = condition_styles(list(dict.fromkeys(words.values())))
+    styles = condition_styles(list(dict.fromkeys(conditions.values())))
     parts = []
     for key, axis, name in ERRORS:
         measured = [
-            Measured(row.trajectory, row.label, words[row.setting], row.values[key])
+            Measured(row.trajectory, row.label, conditions[row.setting], row.values[key])
             for row in rows
-            if key in row.values
+            if row.setting in conditions and not row.published and key in row.values
         ]
         if measured:
             parts.append(
                 document.figure(
                     f"{name} of every agent, {family}. Means, with 95 % intervals where there are "
                     "several seeds. Dashed: the published values of the same kind; the errata "
-                    "say what stands between the two.",
+                    "explain how the two differ.",
                     by_agent(measured, styles, axis, key),
                     legend(styles, styles),
                 )
@@ -79,37 +92,203 @@ def _figures(document: Document, cases: Sequence[Result]) -> list[str]:
     return parts
 
 
-def _tables(document: Document, setting: str, rows: Sequence[Row]) -> list[str]:
-    """Tracking open; what it took, and what the paper leaves out, folded away."""
+def by_agent(measured: Sequence[Measured], styles: Styles, words: str, key: str) -> list[Panel]:
+    """Return a panel per trajectory, a line per agent, a mark with interval per conditions.
+
+    Parameters
+    ----------
+    measured
+        Estimates, m or rad.
+    styles
+        Styles of the conditions, in their order.
+    words
+        Label of the axis.
+    key
+        Column of the published table whose value is drawn as a line across the panel.
+    """
+    panels = []
+    for name in dict.fromkeys(one.trajectory for one in measured):
+        group = [one for one in measured if one.trajectory == name]
+        labels = list(dict.fromkeys(one.label for one in group))
+        names = [_shortened(label) for label in labels]
+        shown = list(dict.fromkeys(one.conditions for one in group))
+        references = {
+            conditions: row[key]
+            for conditions in shown
+            if (row := published.row(name, conditions)) is not None
+        }
+        values = [end for one in group for end in _ends(one.value)]
+        chart = Chart(
+            decades([[*values, *references.values()]], FLOOR),
+            Scale(len(labels) - 0.4, -0.6),
+            x_label=words, y_names=names, left=12.0 + CHARACTER * max(map(len, names)),
+            height=TOP + BOTTOM + 16.0 * len(labels),
+        )  # fmt: skip
+        for conditions, value in references.items():
+            chart.rule(x=value, kind=f"c{styles[conditions].colour} d1")
+        for one in group:
+            place = labels.index(one.label) + 0.16 * (2 * shown.index(one.conditions) + 1)
+            place -= 0.16 * len(shown)
+            style = styles[one.conditions]
+            low, high = (max(end, FLOOR) for end in _ends(one.value))
+            if high > low:
+                chart.segment((low, high), (place, place), f"c{style.colour} mark")
+            chart.dot(max(one.value.mean, FLOOR), place, f"f{style.colour}")
+        panels.append(Panel(name, chart.svg()))
+    return panels
+
+
+def _shortened(label: str) -> str:
+    """Return a label that fits beside an axis."""
+    return label if len(label) <= LONGEST_LABEL else f"{label[: LONGEST_LABEL - 1]}…"
+
+
+def _ends(value: Estimate) -> tuple[float, float]:
+    """Return the ends of an estimate's interval, both the mean if it has none."""
+    width = value.half_width or 0.0
+    return value.mean - width, value.mean + width
+
+
+def _tables(document: Document, setting: str, rows: Sequence[Row]) -> str:
+    """Return the paper's table, with effort, constraints and further columns folded away."""
     ours = [row for row in rows if not row.published]
     texts: dict[str, Callable[[Row], str]] = {"end": lambda row: row.end}
     if any(row.learning for row in rows):
-        texts["trained"] = trained_words
-    return [
-        document.table(
-            f"Tracking errors in the paper's terms, {setting}.", html_rows(rows, TRACKING, texts)
-        ),
-        folded(
-            "Effort, constraints and further figures",
-            joined(
-                [
-                    document.table(
-                        f"Effort and constraints, {setting}.",
-                        html_rows(
-                            ours,
-                            EFFORT,
-                            {
-                                "solves failed": lambda row: row.failures,
-                                "constraints broken: largest excess, share of control periods": (
-                                    lambda row: row.violations
-                                ),
-                            },
-                        ),
-                    ),
-                    document.table(
-                        f"Beyond the paper's columns, {setting}.", html_rows(ours, FURTHER, {})
-                    ),
-                ]
-            ),
-        ),
+        texts["trained"] = _trained
+    effort: dict[str, Callable[[Row], str]] = {
+        "solves failed": lambda row: row.failures,
+        "constraints broken: largest excess, share of control periods": lambda row: row.violations,
+    }
+    tracking = document.table(
+        f"Tracking errors in the paper's terms, {setting}.", html_rows(rows, TRACKING, texts)
+    )
+    further = [
+        document.table(f"Effort and constraints, {setting}.", html_rows(ours, EFFORT, effort)),
+        document.table(f"Beyond the paper's columns, {setting}.", html_rows(ours, FURTHER, {})),
     ]
+    return joined([tracking, folded("Effort, constraints and further figures", joined(further))])
+
+
+def _trained(row: Row) -> str:
+    """Return the cost of learning, each quantity kept on one line with its unit."""
+    words = ", ".join(part.replace(" ", "\u00a0") for part in row.learning.split(", "))
+    return words or ("" if row.published else "–")
+
+
+def html_rows(
+    rows: Sequence[Row], columns: Sequence[Column], texts: Mapping[str, Callable[[Row], str]]
+) -> str:
+    """Return an HTML table of one setting: trajectory, agent, numeric columns, columns of text.
+
+    Every line names its trajectory, so that lines keep their meaning when they are sorted; the
+    style sheet hides repetitions where lines are grouped.
+    """
+    heads = "".join(
+        f'<th class="n" scope="col">{html.escape(column.heading)} '
+        f"<small>{html.escape(column.unit)}</small></th>"
+        for column in columns
+    ) + "".join(f'<th scope="col">{html.escape(heading)}</th>' for heading in texts)
+    lines = []
+    seen = ""
+    for row in rows:
+        first = row.trajectory != seen
+        seen = row.trajectory
+        classes = " ".join(
+            name for name, on in (("published", row.published), ("first", first)) if on
+        )
+        cells = "".join(
+            f'<td class="n">{html.escape(column.text(row))}</td>' for column in columns
+        ) + "".join(f'<td class="t">{html.escape(words(row))}</td>' for words in texts.values())
+        label = html.escape(row.label + (f" ×{row.runs}" if row.runs > 1 else ""))
+        mark = f' class="{classes}"' if classes else ""
+        lines.append(
+            f'<tr{mark}><td class="path">{html.escape(row.trajectory)}</td>'
+            f'<th class="who" scope="row">{label}</th>{cells}</tr>'
+        )
+    longest = max((len(row.trajectory) for row in rows), default=4)
+    body = "\n".join(lines)
+    return (
+        f'<table class="grouped" style="--path: {min(max(longest, 4), 9)}ch"><thead><tr>'
+        f'<th class="path" scope="col">path</th><th class="who" scope="col">agent</th>{heads}'
+        f"</tr></thead>\n<tbody>\n{body}\n</tbody></table>"
+    )
+
+
+def curvature_section(document: Document, cases: Sequence[Result], styles: Styles) -> str:
+    """Return errors by the path's curvature: a figure, and a table for each setting."""
+    lines = {
+        setting: found
+        for setting, group in tables.cases_by_setting(cases).items()
+        if (found := band_lines(group))
+    }
+    if not lines:
+        return ""
+    family = main_family(cases)
+    own = {
+        setting: lines[setting]
+        for setting in dict.fromkeys(
+            tables.setting_of(case) for case in cases if family_of(case) == family
+        )
+        if setting in lines
+    }
+    figure = ""
+    if own:
+        figure = document.figure(
+            "ALE by the path's curvature. Mean with its 95 % interval over seeds where there are "
+            "several; hollow marks are those whose lines are dashed elsewhere.",
+            by_band(own, styles),
+            legend(styles, [label for found in own.values() for label, _ in found]),
+            wide=True,
+        )
+
+    def table(setting: str, _: Sequence[Result]) -> str:
+        if setting not in lines:
+            return ""
+        caption = f"ALE (m) by the path's curvature, {setting}."
+        return document.table(caption, _band_table(lines[setting]))
+
+    return joined([paragraph(NOTE), figure, per_setting(cases, table)])
+
+
+def by_band(lines: Mapping[str, Sequence[Line]], styles: Styles) -> list[Panel]:
+    """Return a panel per setting: ALE of each agent in each band of curvature, with intervals."""
+    panels = []
+    for title, agents in lines.items():
+        every = [end for _, cells in agents for cell in cells if cell for end in _ends(cell.ale)]
+        chart = Chart(
+            Scale(-0.5, len(BANDS.names) - 0.5), decades([every], FLOOR),
+            x_names=BANDS.names, y_label="ALE (m)", x_label="|curvature| of the path",
+            height=230.0,
+        )  # fmt: skip
+        for k, (label, cells) in enumerate(agents):
+            offset = 0.8 * ((k + 0.5) / len(agents) - 0.5)
+            for band, cell in enumerate(cells):
+                if cell is None:
+                    continue
+                low, high = (max(end, FLOOR) for end in _ends(cell.ale))
+                interval = low, max(cell.ale.mean, FLOOR), high
+                chart.interval(band + offset, interval, styles[label])
+        panels.append(Panel(title, chart.svg()))
+    return panels
+
+
+def _band_table(lines: Iterable[Line]) -> str:
+    heads = "".join(
+        f'<th class="n" scope="col">{html.escape(name)}<small>{html.escape(words)} 1/m</small></th>'
+        for name, words in zip(BANDS.names, band_ranges(), strict=True)
+    )
+    body = "\n".join(
+        f'<tr><th class="who" scope="row">{html.escape(label)}</th>'
+        + "".join(
+            f'<td class="n">{cell.error}<small>{html.escape(cell.basis)}</small></td>'
+            if cell
+            else '<td class="n">–</td>'
+            for cell in cells
+        )
+        + "</tr>"
+        for label, cells in lines
+    )
+    return (
+        f'<table><thead><tr><th class="who" scope="col">agent</th>{heads}</tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody></table>"
+    )

@@ -1,36 +1,55 @@
-"""Section on computing: how long calls of `predict` took, against the control period."""
+"""Sections on cost: times of `predict` against the control period, and what learning took."""
 
+import html
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.report.charts import Chart
-from experiments.report.document import Document, first_open, joined, paragraph
-from experiments.report.drives import Drive, by_setting, family_of
-from experiments.report.html_tables import html_table
-from experiments.report.path_figures import Panel
-from experiments.report.scales import Scale, decades
-from experiments.report.styles import Styles, legend
+from experiments.report.charts import Chart, Scale, decades
+from experiments.report.drives import Drive, Result, by_setting, family_of
+from experiments.report.page import (
+    Document,
+    Panel,
+    Styles,
+    first_open,
+    html_table,
+    joined,
+    legend,
+    paragraph,
+)
+from experiments.run.learning_table import trainings
+from experiments.run.learning_words import UNKNOWN, duration
 
 Array = NDArray[np.float64]
 
 RAREST = 1e-4
-"""Least share of calls that is drawn."""
+"""Smallest share of calls that is drawn."""
 PERIOD = 0.05
 HEADINGS = (
     "agent", "calls", "median, ms", "95 %, ms", "99 %, ms", "longest, ms", "control period, ms",
     "longer than the period, %",
 )  # fmt: skip
 NOTE = (
-    "Whole calls of predict, on the machine of the manifest with all its workers busy. Calls of "
-    "the drives that are drawn (of several seeds the first); the first call of an episode counts "
-    "like any other."
+    "Times of whole calls of predict, on the machine of the manifest with all its workers busy, "
+    "in the drives that are drawn (of several seeds the first). The first call of an episode "
+    "counts like any other."
+)
+LEARNING_NOTE = (
+    "Environment steps, wall time with validation on the training machine, and NMPC solves for "
+    "demonstrations or for the base of a residual policy. They count the whole training, although "
+    "the agent drives with the checkpoint that was best on the validation paths, and include the "
+    "training that it continued (--from), if any. Agents that are not listed were designed by "
+    "hand, at a cost that was not recorded."
+)
+TRAINED_NOTE = (
+    "Trained: environment steps, wall time and NMPC solves of the training; “–” for agents "
+    "designed by hand, whose cost was not recorded."
 )
 
 
 def calls_of(drives: Iterable[Drive]) -> dict[str, Array]:
-    """Times (s) of all calls of each agent; periods in which it was still busy are none."""
+    """Return the times (s) of all calls of each agent, without periods in which it was busy."""
     found: dict[str, list[Array]] = {}
     for drive in drives:
         seconds = drive.trace["solve_time"][1:]
@@ -39,7 +58,7 @@ def calls_of(drives: Iterable[Drive]) -> dict[str, Array]:
 
 
 def computing_section(document: Document, drives: Sequence[Drive], styles: Styles) -> str:
-    """Distribution of the calls' times, and how many were longer than the control period."""
+    """Return the distribution of the calls' times, and the share that missed the deadline."""
     groups = {
         setting: (group, calls)
         for setting, group in by_setting(drives).items()
@@ -61,7 +80,7 @@ def computing_section(document: Document, drives: Sequence[Drive], styles: Style
         "period, which is the deadline.",
         panels, legend(styles, shown), wide=True,
     )  # fmt: skip
-    told = [
+    parts = [
         (
             setting in drawn,
             document.table(
@@ -75,7 +94,7 @@ def computing_section(document: Document, drives: Sequence[Drive], styles: Style
         )
         for setting, (group, calls) in groups.items()
     ]
-    return joined([paragraph(NOTE), figure, first_open(told, "Other settings")])
+    return joined([paragraph(NOTE), figure, first_open(parts, "Other settings")])
 
 
 def _period(drives: Iterable[Drive]) -> float:
@@ -89,15 +108,14 @@ def _exceedance(calls: Mapping[str, Array], styles: Styles, period: float) -> st
         Scale(RAREST, 1.15, log=True),
         x_label="time t (ms)", y_label="share of calls longer than t", height=230.0,
     )  # fmt: skip
-    for label in styles:
+    for label, style in styles.items():
         if label not in calls:
             continue
         ordered = np.sort(calls[label])
         longer = 1.0 - np.arange(1, len(ordered) + 1) / len(ordered)
-        # Evenly over the logarithm of the share: the tail counts as much as the middle.
+        # Evenly over the logarithm of the share, so that the tail is as detailed as the middle.
         wanted = np.geomspace(1.0, RAREST, 160)
         kept = np.unique(np.searchsorted(-longer, -wanted).clip(0, len(ordered) - 1))
-        style = styles[label]
         chart.line(
             1e3 * ordered[kept], np.maximum(longer[kept], 0.5 * RAREST), style.kind, style.width
         )
@@ -114,3 +132,31 @@ def _line(label: str, calls: Array, period: float) -> list[str]:
         label, f"{len(calls):,}", f"{median:.3f}", f"{high:.3f}", f"{rare:.3f}",
         f"{1e3 * calls.max():.2f}", f"{1e3 * period:g}", share,
     ]  # fmt: skip
+
+
+def learning_section(document: Document, cases: Iterable[Result]) -> str:
+    """Return the cost of each learned policy and the command that trains it; "" without any."""
+    found = trainings(cases)
+    if not found:
+        return ""
+    lines = [
+        [
+            label,
+            str(training.get("algorithm", UNKNOWN)),
+            f"{training['steps']:,}" if "steps" in training else UNKNOWN,
+            duration(training["seconds"]) if "seconds" in training else UNKNOWN,
+            f"{training['solves']:,}" if "solves" in training else UNKNOWN,
+        ]
+        for label, training in found
+    ]
+    headings = ("agent", "algorithm", "steps", "wall time", "NMPC solves")
+    commands = "\n".join(
+        f"# {label}\n{training.get('command', f'# {UNKNOWN}')}" for label, training in found
+    )
+    return joined(
+        [
+            paragraph(LEARNING_NOTE),
+            document.table("What learning cost.", html_table(headings, lines, range(2, 5))),
+            f'<pre tabindex="0">{html.escape(commands)}</pre>',
+        ]
+    )

@@ -1,6 +1,6 @@
-"""What a report draws: cases with their traces, grouped by setting and by conditions."""
+"""Drives that a report draws: cases with their traces, grouped by setting and by conditions."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trajectories
+from experiments.report.page import first_open
 from experiments.run import tables
 from experiments.run.store import ResultStore
 from lpv_track_env import vehicle
-from lpv_track_env.bicycle import X, Y
+from lpv_track_env.bicycle import PSI, X, Y
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 
@@ -25,12 +26,12 @@ TRACE = (
 )  # fmt: skip
 """Arrays that a trace must hold to be drawn."""
 LEAD = "lpv-nmpc"
-"""Whose figures stand first where it has driven."""
+"""Agent whose figures come first, if it has driven."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """One case with its trace, under the label that it has in the tables."""
+    """A case with its trace and its agent's label in the tables."""
 
     label: str
     trajectory: str
@@ -39,7 +40,7 @@ class Drive:
 
     @property
     def finished(self) -> bool:
-        """Whether it drove the whole path."""
+        """True if the drive reached the end of the path."""
         return bool(self.case.get("end") == "finished")
 
     @property
@@ -57,26 +58,26 @@ class Family:
 
     @property
     def conditions(self) -> list[str]:
-        """The conditions that it has drives under, those of the first drive first."""
+        """Conditions of its drives, in order."""
         return list(dict.fromkeys(drive.conditions for drive in self.drives))
 
     @property
     def labels(self) -> list[str]:
-        """Its agents, the leading one first."""
+        """Labels of its agents, the leading one first."""
         found = dict.fromkeys(drive.label for drive in self.drives)
         return sorted(found, key=lambda label: label != LEAD)
 
     def under(self, conditions: str) -> list[Drive]:
-        """Its drives under one kind of conditions."""
+        """Return its drives under the given conditions."""
         return [drive for drive in self.drives if drive.conditions == conditions]
 
     def of(self, label: str) -> list[Drive]:
-        """Its drives by one agent."""
+        """Return the drives of one agent."""
         return [drive for drive in self.drives if drive.label == label]
 
 
 def usable(trace: Mapping[str, Array] | None) -> bool:
-    """Whether a trace holds what the figures need, finite and of one length."""
+    """Return whether a trace holds all arrays of `TRACE`, finite and of one length."""
     if not trace or any(name not in trace for name in TRACE):
         return False
     n = len(trace["time"])
@@ -86,7 +87,7 @@ def usable(trace: Mapping[str, Array] | None) -> bool:
 
 
 def drives_of(cases: Iterable[Result], store: ResultStore) -> tuple[list[Drive], list[Result]]:
-    """What can be drawn: of each agent, setting and trajectory the first seed; and what lacks."""
+    """Return the first seed's drive of every agent, setting and path, and cases without a trace."""
     drives: dict[tuple[str, str, str], Drive] = {}
     missing: list[Result] = []
     for case in cases:
@@ -103,48 +104,57 @@ def drives_of(cases: Iterable[Result], store: ResultStore) -> tuple[list[Drive],
 
 
 def family_of(case: Result) -> str:
-    """Words for all that cases of one family share: their setting but for the conditions."""
+    """Return the setting of a case without its conditions, in words."""
     return tables.setting_of({**case, "conditions": "simulation"})
 
 
 def in_families(cases: Sequence[Result]) -> list[Result]:
-    """Cases in the same order, but those of a family together: conditions beside each other."""
+    """Return the cases with those of each family together, otherwise in the same order."""
     places = {name: place for place, name in enumerate(dict.fromkeys(map(family_of, cases)))}
     return sorted(cases, key=lambda case: places[family_of(case)])
 
 
 def main_family(cases: Iterable[Result]) -> str:
-    """The first family: whose figures and tables stand open."""
+    """Return the first family, whose figures and tables are not folded away."""
     return family_of(next(iter(cases)))
 
 
+def per_setting(cases: Sequence[Result], content: Callable[[str, Sequence[Result]], str]) -> str:
+    """Join content(setting, its cases): the main family's shown, other settings folded away."""
+    family = main_family(cases)
+    parts = [
+        (family_of(group[0]) == family, content(setting, group))
+        for setting, group in tables.cases_by_setting(cases).items()
+    ]
+    return first_open([part for part in parts if part[1]], "Other settings")
+
+
 def families(drives: Iterable[Drive]) -> list[Family]:
-    """Drives by family, in order."""
-    groups: dict[str, list[Drive]] = {}
-    for drive in drives:
-        groups.setdefault(family_of(drive.case), []).append(drive)
+    """Group drives by family, in order."""
+    groups = _grouped(drives, lambda drive: family_of(drive.case))
     return [Family(name, group) for name, group in groups.items()]
 
 
 def by_setting(drives: Iterable[Drive]) -> dict[str, list[Drive]]:
-    """Drives by setting, in order."""
-    groups: dict[str, list[Drive]] = {}
-    for drive in drives:
-        groups.setdefault(tables.setting_of(drive.case), []).append(drive)
-    return groups
+    """Group drives by setting, in order."""
+    return _grouped(drives, lambda drive: tables.setting_of(drive.case))
 
 
 def by_trajectory(drives: Iterable[Drive]) -> dict[str, list[Drive]]:
-    """Drives by trajectory, in order."""
+    """Group drives by trajectory, in order."""
+    return _grouped(drives, lambda drive: drive.trajectory)
+
+
+def _grouped(drives: Iterable[Drive], key: Callable[[Drive], str]) -> dict[str, list[Drive]]:
     groups: dict[str, list[Drive]] = {}
     for drive in drives:
-        groups.setdefault(drive.trajectory, []).append(drive)
+        groups.setdefault(key(drive), []).append(drive)
     return groups
 
 
 @cache
 def reference_path(trajectory: str) -> ReferencePath | None:
-    """Geometry of a case's trajectory by its name or file, or None where that is not to be had."""
+    """Return the path of a trajectory's name or file, or None if it cannot be loaded."""
     try:
         return trajectories.load(trajectory)
     except (ValueError, OSError):
@@ -152,28 +162,32 @@ def reference_path(trajectory: str) -> ReferencePath | None:
 
 
 def foot_points(trace: Mapping[str, Array]) -> tuple[Array, Array, Array]:
-    """X, Y (m) and heading (rad, unwrapped) of the path at a trace's foot points, each (n,).
+    """Return X, Y (m) and heading (rad, unwrapped) of the path at a trace's foot points, each (n,).
 
     The foot point lies a lateral error to the right of the vehicle, seen along the path.
     """
-    heading = np.unwrap(trace["state"][:, 2] - trace["heading_error"])
+    heading = np.unwrap(trace["state"][:, PSI] - trace["heading_error"])
     x = trace["state"][:, X] + trace["lateral_error"] * np.sin(heading)
     y = trace["state"][:, Y] - trace["lateral_error"] * np.cos(heading)
     return x, y, heading
 
 
+def longest_trace(drives: Sequence[Drive]) -> Mapping[str, Array]:
+    """Return the trace that reaches furthest along the path."""
+    return max((drive.trace for drive in drives), key=lambda trace: trace["arc_length"][-1])
+
+
 def reference_line(drives: Sequence[Drive]) -> tuple[Array, Array]:
-    """X and Y (m) of a trajectory; where it is not to be had, of what was driven of it."""
+    """Return X and Y (m) of a trajectory, or of the driven part of it if it cannot be loaded."""
     path = reference_path(drives[0].trajectory)
     if path is not None:
         return path.x, path.y
-    longest = max((drive.trace for drive in drives), key=lambda trace: trace["arc_length"][-1])
-    x, y, _ = foot_points(longest)
+    x, y, _ = foot_points(longest_trace(drives))
     return x, y
 
 
 def plant(case: Result) -> VehicleParameters | None:
-    """The vehicle of a case with its changes, or None where it no longer loads."""
+    """Return the vehicle of a case with its changes, or None if it cannot be loaded."""
     changes = {
         key: tuple(value) if isinstance(value, list) else value
         for key, value in (case.get("vehicle_changes") or {}).items()

@@ -1,4 +1,4 @@
-"""The replay's data and place: chosen drives, thinned and quantised, for the page's own script."""
+"""Replay of drives: the data that `replay.js` shows, thinned and quantised."""
 
 import base64
 import json
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.report.charts import spread
-from experiments.report.document import joined, paragraph
 from experiments.report.drives import (
     Drive,
     by_setting,
@@ -19,28 +18,29 @@ from experiments.report.drives import (
     plant,
     reference_line,
 )
+from experiments.report.page import joined, paragraph
 from lpv_track_env.bicycle import PSI, VX, X, Y
 
 Array = NDArray[np.float64]
 
 SCRIPT = "replay.js"
 SAMPLES = 500
-"""Most moments of a drive; between them the script interpolates."""
+"""Largest number of samples of a drive; the script interpolates between them."""
 REFERENCE_POINTS = 1000
 BUDGET = 3_000_000
-"""Bytes of all drives' data."""
+"""Largest size of all drives' data, bytes."""
 PLACE = (
     '<div class="replay" id="replay" role="group" aria-label="Replay of drives" hidden></div>\n'
     "<noscript><p>The replay needs JavaScript; everything else reads without.</p></noscript>"
 )
 QUANTA = 32_000
-"""Steps of a signed 16-bit number on each side of the middle of a quantity's range."""
+"""Steps of a signed 16-bit integer on each side of the middle of a quantity's range."""
 BODY = (4.5, 1.8, 1.3, 1.4)
-"""Length, width, front and rear axle distance (m), where a vehicle no longer loads."""
+"""Length, width, front and rear axle distance (m) of a vehicle that cannot be loaded."""
 
 
 def quantised(values: Array) -> list[Any]:
-    """Middle, quantum and 16-bit little-endian integers in base64 of values (n,)."""
+    """Return middle, quantum and 16-bit little-endian integers in base64 of values (n,)."""
     middle = 0.5 * float(values.max() + values.min())
     quantum = max(float(np.ptp(values)) / (2 * QUANTA), 1e-9)
     whole = np.rint((values - middle) / quantum).astype("<i2")
@@ -51,7 +51,7 @@ def quantised(values: Array) -> list[Any]:
 
 
 def moments(drive: Drive) -> dict[str, Any]:
-    """One drive: its words, its end, and its quantities at evenly spaced times."""
+    """Return the labels, the end and the quantities of a drive at evenly spaced times."""
     trace, case = drive.trace, drive.case
     time = trace["time"]
     count = min(len(time), SAMPLES)
@@ -83,10 +83,10 @@ def moments(drive: Drive) -> dict[str, Any]:
 
 
 def chosen(drives: Sequence[Drive], budget: int = BUDGET) -> list[tuple[Drive, str]]:
-    """Drives to embed, each with its JSON: whole settings while all together keep to the budget.
+    """Return the drives to embed, each with its JSON: whole settings while they fit the budget.
 
-    The first family's conditions come first. Of a first setting that alone is too large, the
-    drives that fit.
+    The first family's conditions come first. If the first setting alone is too large, those of its
+    drives that fit are embedded.
     """
     kept: list[tuple[Drive, str]] = []
     used = 0
@@ -104,7 +104,7 @@ def chosen(drives: Sequence[Drive], budget: int = BUDGET) -> list[tuple[Drive, s
 
 
 def data_block(kept: Sequence[tuple[Drive, str]]) -> str:
-    """The script element with all data; no word of a results folder can end it."""
+    """Return the script element with all data; no text of a results folder can end it."""
     paths: dict[str, Mapping[str, Any]] = {}
     for name, group in by_trajectory(drive for drive, _ in kept).items():
         x, y = reference_line(group)
@@ -112,31 +112,31 @@ def data_block(kept: Sequence[tuple[Drive, str]]) -> str:
         paths[name] = {"count": len(at), "x": quantised(x[at]), "y": quantised(y[at])}
     runs = ",".join(text for _, text in kept)
     text = f'{{"paths":{json.dumps(paths, separators=(",", ":"))},"runs":[{runs}]}}'
-    # In JSON, < stands in strings alone.
+    # In JSON, < occurs in strings only.
     safe = text.replace("<", "\\u003c")
     return f'<script type="application/json" id="replay-data">{safe}</script>'
 
 
 def replay_section(drives: Sequence[Drive]) -> str:
-    """The replay's place in the page with its data; "" without drives."""
+    """Return the element that the replay fills, with its data; "" without drives."""
     kept = chosen(drives)
     if not kept:
         return ""
     groups = by_setting(drive for drive, _ in kept)
     left = [setting for setting in by_setting(drives) if setting not in groups]
     rule = (
-        f"{len(kept)} drives are embedded: of each agent the first seed on each path, settings "
-        f"whole and in order until {BUDGET / 1e6:g} MB are used ({'; '.join(groups)}). A drive is "
-        f"thinned to at most {SAMPLES} moments, quantities to 16 bits; exact values are in the "
-        "results folder."
+        f"{len(kept)} drives are embedded: every agent's first seed on every path, setting by "
+        f"setting up to {BUDGET / 1e6:g} MB ({'; '.join(groups)}). A drive is thinned to at most "
+        f"{SAMPLES} samples, quantities to 16 bits; the results folder has the exact values."
     )
     if left:
         rule += f" Not embedded: {'; '.join(left)}."
     return joined(
         [
             paragraph(
-                "Choose a path and one or two drives; play, or drag the slider or a chart. With "
-                "the slider in focus the arrow keys step, Home and End jump; the space bar plays."
+                "Choose a path and one or two drives, then play, or drag the slider or a chart. "
+                "With the slider in focus, the arrow keys step and Home and End jump; the space "
+                "bar plays and pauses."
             ),
             PLACE,
             paragraph(rule, "soft"),

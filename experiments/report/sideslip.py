@@ -1,4 +1,4 @@
-"""Section on |vy| <= 0.17 vx: where it stops a vehicle from following the path, and the cost."""
+"""Section on the limit |vy| <= 0.17 vx: where it forbids the path, and which cases reached it."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.report.charts import Chart, decimate, spread
-from experiments.report.document import Document, folded, joined, paragraph
+from experiments.report.charts import Chart, around, decimate, exactly, spread
+from experiments.report.drive_figures import POINTS, reference_chart
 from experiments.report.drives import (
     Drive,
     Result,
@@ -16,10 +16,16 @@ from experiments.report.drives import (
     plant,
     reference_path,
 )
-from experiments.report.html_tables import html_table
-from experiments.report.path_figures import POINTS, Panel, reference_chart
-from experiments.report.scales import around, exactly
-from experiments.report.styles import Styles, legend
+from experiments.report.page import (
+    Document,
+    Panel,
+    Styles,
+    folded,
+    html_table,
+    joined,
+    legend,
+    paragraph,
+)
 from experiments.run import tables
 from lpv_track_env.bicycle import VX, VY, X, Y
 from lpv_track_env.vehicle import VehicleParameters
@@ -27,41 +33,46 @@ from lpv_track_env.vehicle import VehicleParameters
 Array = NDArray[np.float64]
 
 AT_LIMIT = 0.99
-"""Share of the limit on |vy|/vx from which on a vehicle is drawn as being at it."""
+"""Share of the limit on |vy|/vx above which a vehicle is drawn as being at the limit."""
 EXCESS = 1e-3
+"""Excess or slack that counts as reaching the limit, m/s."""
 USUAL = 0.17
+"""Limit drawn where the vehicle cannot be loaded."""
 FEW = 12
-"""Most lines of a table that stands open."""
+"""Number of lines up to which the table of cases is not folded away."""
 
 
 def sideslip(trace: Mapping[str, Array]) -> Array:
-    """|vy| / vx along a trace, (n,)."""
+    """Return |vy| / vx along a trace, (n,)."""
     state = trace["state"]
     return np.abs(state[:, VY]) / np.maximum(state[:, VX], 1e-3)
 
 
 def steady_sideslip(curvature: Array, speed: Array, car: VehicleParameters) -> Array:
-    """|vy| / vx of a steady turn, any shape: |kappa (lr - m lf v^2 / (L Car))|.
+    """Return |vy| / vx of a steady turn, |kappa (lr - m lf v^2 / (L Car))|, any shape.
 
-    From the rear axle, whose lateral force in a steady turn is m v^2 kappa lf / L.
+    It follows from the lateral force on the rear axle in a steady turn, m v^2 kappa lf / L.
     """
     give = car.mass * car.front_axle_distance / (car.wheelbase * car.rear_cornering_stiffness)
     return np.abs(curvature * (car.rear_axle_distance - give * speed**2))
 
 
 def required_sideslip(drive: Drive) -> tuple[Array, Array] | None:
-    """Arc length and |vy| / vx of driving exactly on the path at its speed, steady; or None."""
+    """Return arc length and |vy| / vx of steady driving on the path at its reference speed.
+
+    None if the path or the vehicle cannot be loaded.
+    """
     path, car = reference_path(drive.trajectory), plant(drive.case)
     if path is None or car is None:
         return None
     reach = drive.trace["arc_length"]
     order = np.argsort(reach, kind="stable")
-    asked = np.interp(path.arc_length, reach[order], drive.trace["reference_speed"][order])
-    return path.arc_length, steady_sideslip(path.curvature, asked, car)
+    speed = np.interp(path.arc_length, reach[order], drive.trace["reference_speed"][order])
+    return path.arc_length, steady_sideslip(path.curvature, speed, car)
 
 
 def reaches_limit(case: Result) -> bool:
-    """Whether |vy| <= ratio vx was broken, or a plan needed slack on it."""
+    """Return whether |vy| <= ratio vx was violated, or a plan needed slack on it."""
     slack = case.get("solver", {}).get("slack") or (0.0, 0.0, 0.0)
     excess = case.get("metrics", {}).get("excess_lateral_velocity", 0.0)
     return bool(excess > EXCESS or slack[1] > EXCESS)
@@ -70,14 +81,14 @@ def reaches_limit(case: Result) -> bool:
 def sideslip_section(
     document: Document, cases: Sequence[Result], drives: Sequence[Drive], styles: Styles
 ) -> str:
-    """What the limit means, which cases reached it, and where."""
+    """Return what the limit means, which cases reached it, and where."""
     parts = [
         paragraph(
             "The paper bounds |vy| by 0.17 vx at the centre of gravity. In a steady turn vy/vx is "
             "κ (lr − m lf v² / (L Car)), at low speed about lr κ: the bound is a limit on the "
             "curvature that may be driven, whatever the speed. On sharper bends a controller that "
-            "keeps it must leave the path, and one that follows the path must break it. The "
-            "published errors (MLE 0.7 to 1.6 m, MOE 0.3 to 0.6 rad) look like that limit at work."
+            "respects it must leave the path, and one that follows the path must violate it. The "
+            "published errors (MLE 0.7 to 1.6 m, MOE 0.3 to 0.6 rad) are consistent with that."
         )
     ]
     if limits := _limits(cases):
@@ -91,7 +102,7 @@ def sideslip_section(
     by_id = {drive.case["id"]: drive for drive in drives}
     table = document.table(
         "Cases that broke the limit, or whose plans needed slack on it. “Needed” is the share "
-        "of the path's length whose curvature asks for more than the limit at the path's own "
+        "of the path's length whose curvature requires more than the limit at the reference "
         "speed; “at the limit” is the length driven at 99 % of it or more.",
         _reached(reached, by_id),
     )
@@ -101,8 +112,8 @@ def sideslip_section(
         parts.append(
             document.figure(
                 f"Sideslip at its limit, {setting}. Above: |vy|/vx driven, its limit (dashed), "
-                "what the path needs (grey), and where that is over the limit (shaded). Below: "
-                "the path, red where the limit is reached.",
+                "what the path requires (grey), and where that exceeds the limit (shaded). Below: "
+                "the driven path, red where the limit is reached.",
                 _panels(group, styles),
                 legend(styles, {drive.label for drive in group}),
             )
@@ -111,7 +122,7 @@ def sideslip_section(
 
 
 def _limits(cases: Iterable[Result]) -> list[tuple[str, float, float]]:
-    """Name, limit on |vy|/vx and lr of every vehicle that still loads."""
+    """Return name, limit on |vy|/vx and lr of every vehicle that can be loaded."""
     found: dict[tuple[str, float, float], None] = {}
     for case in cases:
         car = plant(case)
@@ -158,7 +169,7 @@ def _lengths(drive: Drive) -> tuple[str, str]:
 
 
 def _panels(drives: Sequence[Drive], styles: Styles) -> list[Panel]:
-    """|vy| / vx over arc length against its limit; below, where the limit was reached."""
+    """Draw |vy| / vx over arc length with its limit; below, where on the path it was reached."""
     return [
         Panel(name, _shares(group, styles) + _places(group, styles))
         for name, group in by_trajectory(drives).items()

@@ -1,162 +1,181 @@
-"""Sections of figures: paths in simulation and in real time, errors over time, other settings."""
+"""Sections of figures: driven paths, errors over time, other settings."""
 
 from collections.abc import Callable, Sequence
 
-from experiments.report import path_figures, time_figures
-from experiments.report.document import Document, folded, joined, paragraph
+from experiments.figures import COLOURS
+from experiments.report import drive_figures
+from experiments.report.drive_figures import StyleOf
 from experiments.report.drives import Drive, Family, Result, families
-from experiments.report.path_figures import Panel, StyleOf
-from experiments.report.styles import LineStyle, Styles, legend
+from experiments.report.page import (
+    DASHES,
+    Document,
+    LineStyle,
+    Panel,
+    Styles,
+    folded,
+    joined,
+    legend,
+    paragraph,
+)
 from experiments.run import tables
 
 Draw = Callable[[Sequence[Drive], StyleOf], list[Panel]]
 
 CONDITIONS = (LineStyle(0, 0, 2.2), LineStyle(1, 0, 1.2))
-"""The first and the second kind of conditions; further ones take the next colours."""
-START = "Reference broad and grey, start ●, an end before the path's ×."
-OVER_TIME: tuple[tuple[str, str, Draw], ...] = (
-    (
-        "Lateral error over time",
-        "Left of the path is positive. Scales differ between panels.",
-        time_figures.lateral_error,
-    ),
+"""Styles of the first and the second conditions; further ones take the next colours."""
+MARKS = "The broad grey line is the reference, ● its start; × marks a drive that ended early."
+MAGNIFIED = "Lateral errors are multiplied by the factor above the panel."
+YAW = "The broad grey line is the path's heading at the foot points of the first drive."
+LATERAL_ERROR = (
+    "Lateral error over time", "Left of the path is positive. Scales differ between panels.",
+    drive_figures.lateral_error,
+)  # fmt: skip
+ERRORS: tuple[tuple[str, str, Draw], ...] = (
+    LATERAL_ERROR,
     (
         "Orientation error over time",
-        "Heading less the path's, in (−π, π]; on a bend sideslip keeps it from zero.",
-        time_figures.heading_error,
+        "Vehicle's heading minus the path's, in (−π, π]; on bends sideslip keeps it from zero.",
+        drive_figures.heading_error,
     ),
 )
+"""Title, remark and function of each figure."""
 DRIVING: tuple[tuple[str, str, Draw], ...] = (
-    ("Speed over arc length", "The path's reference speed broad and grey.", time_figures.speed),
+    (
+        "Speed over arc length",
+        "The broad grey line is the path's reference speed.",
+        drive_figures.speed,
+    ),
     (
         "Inputs over time",
         "Steering angle and acceleration in force, after the actuators.",
-        time_figures.inputs,
+        drive_figures.inputs,
     ),
 )
 
 
 def condition_styles(names: Sequence[str]) -> dict[str, LineStyle]:
-    """Styles of kinds of conditions, in order."""
+    """Return the style of each kind of conditions."""
+    n = len(COLOURS)
     return {
-        name: CONDITIONS[k] if k < len(CONDITIONS) else LineStyle(k % 7, k // 7 % 4)
+        name: CONDITIONS[k] if k < len(CONDITIONS) else LineStyle(k % n, k // n % DASHES)
         for k, name in enumerate(names)
     }
 
 
-def tracking_section(document: Document, family: Family, styles: Styles) -> str:
-    """Paths and yaw of a family: of one agent under all conditions, or of all agents.
+def figure_sections(
+    document: Document, drives: Sequence[Drive], missing: Sequence[Result], styles: Styles
+) -> None:
+    """Add the sections of figures over paths and time.
 
-    With several kinds of conditions the leading agent's figures stand open, those of the others
-    are folded away. With one, all agents share the panels.
+    With several kinds of conditions the leading agent's figures compare them, and those of the
+    other agents are folded away. With one, all agents share the panels.
     """
-    if len(family.conditions) < 2:
-        return _together(document, family, styles)
-    kinds = condition_styles(family.conditions)
-    shown = legend(kinds, kinds)
-    compared = " and ".join(family.conditions)
+    found = families(drives)
+    note = _not_drawn(drives, missing)
+    if not found:
+        document.section("Paths and yaw", note)
+        return
+    main, *others = found
+    document.section("Paths and yaw", joined([note, _paths_section(document, main, styles)]))
+    document.section("Errors over time", _errors_section(document, main, styles))
+    document.section("Other settings", _other_settings(document, others, styles))
+
+
+def _not_drawn(drives: Sequence[Drive], missing: Sequence[Result]) -> str:
+    """State which seeds are drawn, and which cases cannot be."""
+    parts = []
+    if any(drive.case.get("seed") for drive in drives):
+        parts.append(paragraph("Of several seeds only the first is drawn."))
+    if missing:
+        names = ", ".join(
+            f"{tables.label_of(case)} on {case.get('trajectory')} (seed {case.get('seed')})"
+            for case in missing
+        )
+        parts.append(paragraph(f"Not drawn, because their traces cannot be read: {names}.", "bad"))
+    return joined(parts)
+
+
+def _by_label(styles: Styles) -> StyleOf:
+    return lambda drive: styles[drive.label]
+
+
+def _by_conditions(styles: Styles) -> StyleOf:
+    return lambda drive: styles[drive.conditions]
+
+
+def _paths_section(document: Document, family: Family, styles: Styles) -> str:
+    conditions = family.conditions
+    if len(conditions) < 2:
+        shown = legend(styles, family.labels)
+        where = f"{family.name}, {conditions[0]}"
+        return _path_figures(document, family.drives, where, _by_label(styles), shown)
+    kinds = condition_styles(conditions)
+    shown, style_of = legend(kinds, kinds), _by_conditions(kinds)
+    compared = " and ".join(conditions)
     lead, *others = family.labels
-
-    def of_conditions(drive: Drive) -> LineStyle:
-        return kinds[drive.conditions]
-
-    own = family.of(lead)
     parts = [
         paragraph(f"{family.name}; {compared}, one seed each."),
-        document.figure(
-            f"Paths of {lead}, {compared}, over the reference. {START}",
-            path_figures.paths(own, of_conditions), shown,
-        ),
-        document.figure(
-            f"The same paths of {lead} with deviations magnified. Each point stands as many times "
-            "its lateral error beside the path as the panel says.",
-            path_figures.magnified(own, of_conditions), shown,
-        ),
-        document.figure(
-            f"Yaw of {lead} against the reference's over time. Broad and grey: the path's heading "
-            f"at the foot points of the drive under {family.conditions[0]}.",
-            time_figures.yaw(own, of_conditions), shown,
-        ),
-    ]  # fmt: skip
+        _path_figures(document, family.of(lead), f"{lead}, {compared}", style_of, shown),
+    ]
     folds = [
         document.figure(
-            f"Paths of {label}, {compared}, over the reference.",
-            path_figures.paths(family.of(label), of_conditions), shown,
+            f"Driven paths, {label}, {compared}.",
+            drive_figures.paths(family.of(label), style_of),
+            shown,
         )
         for label in others
-    ]  # fmt: skip
+    ]
     if folds:
         parts.append(folded(f"Paths of the other agents ({len(folds)} figures)", joined(folds)))
     return joined(parts)
 
 
-def _together(document: Document, family: Family, styles: Styles) -> str:
-    def of_label(drive: Drive) -> LineStyle:
-        return styles[drive.label]
-
-    shown = legend(styles, family.labels)
-    where = f"{family.name}, {family.conditions[0]}"
+def _path_figures(
+    document: Document, drives: Sequence[Drive], where: str, style_of: StyleOf, shown: str
+) -> str:
+    """Return figures of driven paths, to scale and magnified, and of yaw."""
+    figures: tuple[tuple[str, Draw], ...] = (
+        (f"Driven paths, {where}. {MARKS}", drive_figures.paths),
+        (f"Driven paths with deviations magnified, {where}. {MAGNIFIED}", drive_figures.magnified),
+        (f"Yaw over time, {where}. {YAW}", drive_figures.yaw),
+    )
     return joined(
-        [
-            document.figure(
-                f"Driven paths over the reference, {where}. {START}",
-                path_figures.paths(family.drives, of_label), shown,
-            ),
-            document.figure(
-                f"The same paths with deviations magnified, {where}. Each point stands as many "
-                "times its lateral error beside the path as the panel says.",
-                path_figures.magnified(family.drives, of_label), shown,
-            ),
-            document.figure(
-                f"Yaw against the reference's over time, {where}. Broad and grey: the path's "
-                "heading at the foot points of the first agent's drive.",
-                time_figures.yaw(family.drives, of_label), shown,
-            ),
-        ]
-    )  # fmt: skip
+        document.figure(caption, draw(drives, style_of), shown) for caption, draw in figures
+    )
 
 
-def errors_section(document: Document, family: Family, styles: Styles) -> str:
-    """Errors over time of the leading agent under all conditions, then of all agents under each."""
+def _errors_section(document: Document, family: Family, styles: Styles) -> str:
+    """Return errors of the leading agent under all conditions, then of all agents under each."""
     parts: list[str] = []
     kinds = condition_styles(family.conditions)
     lead = family.labels[0]
-
-    def of_conditions(drive: Drive) -> LineStyle:
-        return kinds[drive.conditions]
-
-    def of_label(drive: Drive) -> LineStyle:
-        return styles[drive.label]
-
     if len(kinds) > 1:
-        own = family.of(lead)
+        own, style_of = family.of(lead), _by_conditions(kinds)
         parts += [
-            document.figure(
-                f"{title}, {lead}. {caption}", draw(own, of_conditions), legend(kinds, kinds)
-            )
-            for title, caption, draw in (*OVER_TIME, *DRIVING)
+            document.figure(f"{title}, {lead}. {remark}", draw(own, style_of), legend(kinds, kinds))
+            for title, remark, draw in (*ERRORS, *DRIVING)
         ]
     for conditions in family.conditions:
-        group = family.under(conditions)
-        if len(kinds) > 1 and {drive.label for drive in group} == {lead}:
+        group, style_of = family.under(conditions), _by_label(styles)
+        labels = {drive.label for drive in group}
+        if len(kinds) > 1 and labels == {lead}:
             continue
-        shown = legend(styles, {drive.label for drive in group})
-        drawn = OVER_TIME if len(kinds) > 1 else (*OVER_TIME, *DRIVING)
+        figures = ERRORS if len(kinds) > 1 else (*ERRORS, *DRIVING)
         parts += [
             document.figure(
-                f"{title}, every agent, {conditions}. {caption}", draw(group, of_label), shown
+                f"{title}, every agent, {conditions}. {remark}",
+                draw(group, style_of),
+                legend(styles, labels),
             )
-            for title, caption, draw in drawn
+            for title, remark, draw in figures
         ]
     return joined(parts)
 
 
-def other_settings_section(document: Document, others: Sequence[Family], styles: Styles) -> str:
-    """Paths and lateral errors of all families but the first, folded away."""
-
-    def of_label(drive: Drive) -> LineStyle:
-        return styles[drive.label]
-
+def _other_settings(document: Document, others: Sequence[Family], styles: Styles) -> str:
+    """Return paths and lateral errors of all families but the first, folded away."""
+    title, remark, draw = LATERAL_ERROR
+    style_of = _by_label(styles)
     parts = []
     for family in others:
         figures = []
@@ -164,43 +183,10 @@ def other_settings_section(document: Document, others: Sequence[Family], styles:
             group = family.under(conditions)
             shown = legend(styles, {drive.label for drive in group})
             where = f"{family.name}, {conditions}"
+            paths = drive_figures.paths(group, style_of)
             figures += [
-                document.figure(
-                    f"Driven paths, {where}. {START}", path_figures.paths(group, of_label), shown
-                ),
-                document.figure(
-                    f"Lateral error over time, {where}. {OVER_TIME[0][1]}",
-                    time_figures.lateral_error(group, of_label),
-                    shown,
-                ),
+                document.figure(f"Driven paths, {where}. {MARKS}", paths, shown),
+                document.figure(f"{title}, {where}. {remark}", draw(group, style_of), shown),
             ]
         parts.append(folded(f"{family.name} ({len(figures)} figures)", joined(figures)))
     return joined(parts)
-
-
-def missing_words(drives: Sequence[Drive], missing: Sequence[Result]) -> str:
-    """What is drawn of several seeds, and which cases cannot be drawn."""
-    parts = []
-    if any(drive.case.get("seed") for drive in drives):
-        parts.append(paragraph("Of several seeds the first is drawn."))
-    if missing:
-        names = ", ".join(
-            f"{tables.label_of(case)} on {case.get('trajectory')} (seed {case.get('seed')})"
-            for case in missing
-        )
-        parts.append(paragraph(f"Not drawn, for want of a readable trace: {names}.", "bad"))
-    return joined(parts)
-
-
-def figure_sections(
-    document: Document, drives: Sequence[Drive], missing: Sequence[Result], styles: Styles
-) -> None:
-    """Add the sections of figures over paths and time."""
-    found = families(drives)
-    note = missing_words(drives, missing)
-    if not found:
-        document.section("Paths and yaw", note)
-        return
-    document.section("Paths and yaw", joined([note, tracking_section(document, found[0], styles)]))
-    document.section("Errors over time", errors_section(document, found[0], styles))
-    document.section("Other settings", other_settings_section(document, found[1:], styles))

@@ -8,11 +8,8 @@ from numpy.typing import NDArray
 
 from agents.weight_tuning.policy import load
 from agents.weights import TrackingWeights
-from experiments.report.charts import Chart
-from experiments.report.estimate_figures import upright
-from experiments.report.path_figures import Panel
-from experiments.report.scales import Scale, around, decades
-from experiments.report.styles import Styles
+from experiments.report.charts import Chart, Scale, around, decades
+from experiments.report.page import Panel, Styles
 from experiments.run.band_metrics import BANDS
 from experiments.run.statistics import Interval
 from experiments.study.evaluation import EvaluationSet, loop_with
@@ -74,7 +71,7 @@ def regret(rows: Sequence[Judged], greedy: float, styles: Styles) -> list[Panel]
             continue
         # Side by side, where budgets are the same.
         place = row.solves * 1.08 ** (k - 0.5 * len(rows))
-        upright(chart, place, (row.score.low - greedy, value, row.score.high - greedy), style)
+        chart.interval(place, (row.score.low - greedy, value, row.score.high - greedy), style)
     return [Panel("95 % intervals", chart.svg())]
 
 
@@ -89,7 +86,7 @@ def gains_in_bands(every: Mapping[str, Mapping[str, Interval]], styles: Styles) 
         for band, gain in gains.items():
             interval = 100 * gain.low, 100 * gain.value, 100 * gain.high
             place = BANDS.names.index(band) + _offset(k, len(every))
-            upright(chart, place, interval, styles[label])
+            chart.interval(place, interval, styles[label])
     return [Panel("95 % intervals", chart.svg())]
 
 
@@ -150,6 +147,6 @@ def weights_over_curvature(
         )
         chart.rule(y=0.0, kind="zero")
         for place, interval, style in marks:
-            upright(chart, place, interval, style)
+            chart.interval(place, interval, style)
         panels.append(Panel(group, chart.svg()))
     return panels

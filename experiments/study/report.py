@@ -6,10 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.report.document import Document, joined, paragraph
-from experiments.report.html_tables import html_table
-from experiments.report.page import render_page
-from experiments.report.styles import legend, line_styles
+from experiments.report.page import (
+    Document,
+    html_table,
+    joined,
+    legend,
+    line_styles,
+    paragraph,
+)
 from experiments.run.band_metrics import BANDS
 from experiments.run.provenance import hardware, revision, versions
 from experiments.run.statistics import Interval
@@ -79,11 +83,8 @@ def write_report(
     page.section(
         "Manifest", f'<pre tabindex="0">{html.escape(json.dumps(manifest, indent=2))}</pre>'
     )
-    text = render_page(
-        title="Tuning study: weights of the NMPC",
-        subtitle=f"{len(study.seeds)} trainings a rung, {study.solves:,} solves each",
-        contents=page.contents, body=page.body,
-    )  # fmt: skip
+    subtitle = f"{len(study.seeds)} trainings a rung, {study.solves:,} solves each"
+    text = page.render("Tuning study: weights of the NMPC", subtitle)
     write_atomically(file, text.encode())
     summary = {
         **manifest,

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from experiments.report import charts, sideslip
+from experiments.report.appendix import ERRATA
 from experiments.report.build import write_report
 from experiments.report.drives import reference_path, usable
-from experiments.report.errata import ERRATA
-from experiments.report.styles import line_styles
+from experiments.report.page import line_styles
 from experiments.run import published, tables
 from experiments.run.store import ResultStore
 from lpv_track_env import vehicle
@@ -232,7 +232,10 @@ def test_missing_and_damaged_traces_are_named_and_the_rest_is_drawn(tmp_path):
     names[1].write_bytes(names[1].read_bytes()[:500])
     store.append({**case(3, trajectory="T3"), "trace": {"time": np.arange(4.0)}})
     text = page(tmp_path)
-    assert "Not drawn, for want of a readable trace: stanley on T1 (seed 0), stanley on T2" in text
+    assert (
+        "Not drawn, because their traces cannot be read: stanley on T1 (seed 0), stanley on T2"
+        in text
+    )
     assert "stanley on T3" in text
     assert "stanley on T4" not in text
     assert "<svg" in text

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from experiments.report import charts, replay
+from experiments.report.charts import Scale, around, decades, exactly
+from experiments.report.drive_figures import magnified
 from experiments.report.drives import Drive, families, foot_points, in_families
-from experiments.report.page import asset
-from experiments.report.path_figures import magnified
-from experiments.report.scales import Scale, around, decades, exactly
-from experiments.report.styles import LineStyle
+from experiments.report.page import LineStyle, asset
 from experiments.report.summary import over_seeds
 from experiments.run.statistics import rate_interval
 from tests.helpers.made_results import HOSTILE, case, folder_of, page, trace
