@@ -1,1 +1,1 @@
-"""Speed: what the compiled environments are measured against."""
+"""Sections of `lpv-track speed`: environments, solvers, closed loops, learning, processes."""

@@ -1,62 +1,74 @@
-"""Sections of the closed loop: many environments, each with its NMPC and its weights."""
+"""Sections of many environments with agents: compiled closed loops, and learning over them."""
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
+import gymnasium
 import numpy as np
 
 import agents
 from agents.weight_tuning.closed_loop import ClosedLoop
 from agents.weight_tuning.vector_env import WeightTuningVectorEnv
-from experiments.speed import peers
-from experiments.speed.measure import Effort, Section, Tick, calibrated, interleave
+from experiments.speed import environments
+from experiments.speed.measure import (
+    Effort,
+    Round,
+    Section,
+    Tick,
+    Unavailable,
+    calibrated,
+    interleave,
+    module,
+)
+from lpv_track_env.registration import PATH_TRACKING
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 
-Once = Callable[[], float]
-
 PERIODS = 20
-"""Control periods a call: a decision of a weight policy each second, say."""
+"""Control periods per call, e.g. for a weight policy that decides once a second."""
 SPREAD = 0.3
-"""Standard deviation of the logarithms of every environment's own weights."""
+"""Standard deviation of the logarithms of each environment's weights."""
 ERRORS = (0.3, 0.05, 0.5)
-"""m, rad, m/s: range of the errors that episodes start with."""
+"""Half ranges of the initial errors of episodes, m, rad, m/s."""
+ENVS = 8
+ROLLOUT = 256
+"""Steps per environment between two updates of PPO, 10 epochs in batches of 64 each (defaults)."""
 
 
 def loops(section: Section, effort: Effort, tick: Tick) -> None:
-    """Compiled closed loops over the number of environments and threads."""
+    """Measure compiled closed loops over the numbers of environments and threads."""
     section.notes.append(
         "Seconds per control period of one environment, NMPC and plant together: calls of "
-        f"{PERIODS} periods on {' and '.join(effort.trajectories)}, every environment with "
-        "its own weights, "
-        "started anywhere on its path with some error. Resets stand outside the clock."
+        f"{PERIODS} periods on {' and '.join(effort.trajectories)}, every environment with weights "
+        "of its own, started anywhere on its path with random errors. Resets are not timed."
     )
 
-    def make(n: int, threads: int) -> Once:
+    def make(n: int, threads: int) -> Round:
         run = Driving(closed_loop(effort.trajectories, n, threads))
-        once = calibrated(run, effort.round_seconds)
-        return lambda: once() / run.periods
+        seconds_per_call = calibrated(run, effort.round_seconds)
+        return lambda: seconds_per_call() / run.periods
 
     _over_threads(section, effort, tick, ("closed loop", "s/period"), make)
 
 
 def tuning(section: Section, effort: Effort, tick: Tick) -> None:
-    """Decisions on weights, of `WeightTuning-v0`."""
+    """Measure decisions on the NMPC's weights in `WeightTuning-v0`."""
     section.notes.append(
         "Seconds per decision on the NMPC's weights in WeightTuningVectorEnv: step() with random "
         "actions, up to 8 control periods (0.4 s) of estimator, delay compensation, NMPC and plant "
-        f"under `randomised`, on {' and '.join(effort.trajectories)}; episodes begin anew in "
-        "the clock."
+        f"under `randomised`, on {' and '.join(effort.trajectories)}; automatic resets are timed."
     )
 
-    def make(n: int, threads: int) -> Once:
+    def make(n: int, threads: int) -> Round:
         envs = WeightTuningVectorEnv(
             n, list(effort.trajectories), conditions="randomised", random_start=True,
             autoreset_mode="SameStep", threads=threads,
         )  # fmt: skip
         envs.action_space.seed(0)
-        run = peers.stepping(envs, np.stack([envs.action_space.sample() for _ in range(16)]))
-        once = calibrated(run, effort.round_seconds)
-        return lambda: once() / n
+        actions = np.stack([envs.action_space.sample() for _ in range(16)])
+        return calibrated(environments.stepping(envs, actions), effort.round_seconds, n)
 
     _over_threads(section, effort, tick, ("WeightTuning-v0", "s/decision"), make)
 
@@ -66,9 +78,9 @@ def _over_threads(
     effort: Effort,
     tick: Tick,
     series: tuple[str, str],
-    make: Callable[[int, int], Once],
+    make: Callable[[int, int], Round],
 ) -> None:
-    """Rounds of what `make(n, threads)` gives, a series (name, unit) each."""
+    """Measure the rounds of `make(n, threads)`, in a series (name, unit) each."""
     name, unit = series
     for n in effort.batches:
         pairs = []
@@ -83,7 +95,7 @@ def _over_threads(
 
 
 def closed_loop(trajectories: tuple[str, ...], n: int, threads: int) -> ClosedLoop:
-    """N environments with an NMPC each."""
+    """Make n environments with an NMPC each."""
     envs = PathTrackingVectorEnv(
         n, list(trajectories), autoreset_mode="Disabled", random_start=True,
         initial_error_range=ERRORS,
@@ -93,17 +105,17 @@ def closed_loop(trajectories: tuple[str, ...], n: int, threads: int) -> ClosedLo
 
 
 class Driving:
-    """Calls of `drive` on episodes that begin anew each time."""
+    """Time calls of `drive`, each on new episodes."""
 
     def __init__(self, loop: ClosedLoop) -> None:
         n = loop.envs.num_envs
         spread = np.random.default_rng(0).normal(0.0, SPREAD, (n, 10))
         self.loop, self.weights = loop, loop.agent.fixed_weights * np.exp(spread)
         self.periods = 1.0
-        """Control periods that a call of the last round drove, all environments together."""
+        """Control periods driven per call in the last round, summed over the environments."""
 
     def __call__(self, count: int) -> float:
-        """Seconds of `count` calls."""
+        """Return the seconds of `count` calls."""
         seconds = driven = 0.0
         for k in range(count):
             self.loop.reset(seed=k * self.loop.envs.num_envs)
@@ -113,3 +125,108 @@ class Driving:
             driven += float(tally.steps.sum())
         self.periods = driven / count
         return seconds
+
+
+def learning(section: Section, effort: Effort, tick: Tick) -> None:
+    """Measure the share of wall time that stepping takes in Stable-Baselines3's PPO."""
+    section.notes.append(
+        f"Share of the wall time of PPO.learn ({ENVS} environments, default network and batches, "
+        f"one thread, CPU, {ROLLOUT} steps per environment and update) within the VecEnv's step."
+    )
+    kinds = section.available(
+        {environments.OURS: _compiled_vec_env, "DummyVecEnv of single ones": _dummy_vec_env}
+    )
+    shares, rates = {}, {}
+    for name in kinds:
+        shares[name] = section.add(name, "share of wall time", n=ENVS)
+        rates[name] = section.add(name, "s/env-step of learning", n=ENVS)
+    for k in range(effort.learning_rounds):
+        for name, env in kinds.items():
+            tick(f"PPO over {name}, round {k + 1} of {effort.learning_rounds}")
+            share, seconds = _learn(env, effort.learning_steps)
+            shares[name].rounds.append(share)
+            rates[name].rounds.append(seconds)
+    if len(kinds) > 1:
+        ours, other = kinds
+        section.compare(shares[ours], shares[other])
+        section.compare(rates[ours], rates[other])
+
+
+def _compiled_vec_env() -> Any:
+    module("stable_baselines3")
+    return agents.sb3_vec_env(environments.make_vector(ENVS, autoreset_mode="SameStep"))
+
+
+def _dummy_vec_env() -> Any:
+    vec_env = module("stable_baselines3.common.vec_env")
+    make = partial(gymnasium.make, PATH_TRACKING, trajectory=environments.TRAJECTORY)
+    return vec_env.DummyVecEnv([make] * ENVS)
+
+
+def _learn(env: Any, steps: int) -> tuple[float, float]:
+    """Return the VecEnv's share of the wall time of `learn`, and the seconds per env-step."""
+    module("torch").set_num_threads(1)
+    ppo = module("stable_baselines3").PPO
+    timed = _timed(env)
+    rollout = min(ROLLOUT, max(steps // ENVS, 2))
+    model = ppo("MlpPolicy", timed, n_steps=rollout, device="cpu", seed=0)
+    began = time.perf_counter()
+    model.learn(total_timesteps=steps)
+    wall = time.perf_counter() - began
+    return timed.seconds / wall, wall / max(model.num_timesteps, 1)
+
+
+def _timed(env: Any) -> Any:
+    """Wrap a VecEnv to sum up the seconds of its steps."""
+    wrapper = module("stable_baselines3.common.vec_env").VecEnvWrapper
+
+    class Timed(wrapper):  # type: ignore[misc, valid-type]
+        seconds = 0.0
+
+        def reset(self) -> Any:
+            return self.venv.reset()
+
+        def step_async(self, actions: Any) -> None:
+            began = time.perf_counter()
+            self.venv.step_async(actions)
+            self.seconds += time.perf_counter() - began
+
+        def step_wait(self) -> Any:
+            began = time.perf_counter()
+            result = self.venv.step_wait()
+            self.seconds += time.perf_counter() - began
+            return result
+
+    return Timed(env)
+
+
+def training(section: Section, effort: Effort, tick: Tick) -> None:
+    """Measure PPO at the settings of `lpv-track train ppo --fast`, after its first segment."""
+    section.notes.append(
+        "Seconds per environment step of PPO.learn, collecting and updating, without validation; "
+        "one thread."
+    )
+    try:
+        module("stable_baselines3")
+        module("torch")
+    except Unavailable as error:
+        section.leave_out("PPO", str(error))
+        return
+    from stable_baselines3.common.logger import Logger
+
+    from experiments.training.environments import load_paths
+    from experiments.training.loop import make_trainer
+    from experiments.training.settings import FAST, usual
+
+    settings = usual("ppo", **{**FAST, "paths": 4})
+    segment = max(settings.envs * settings.hyperparameters["rollout"], 8 * effort.learning_steps)
+    settings = replace(settings, steps=segment * (effort.learning_rounds + 1), segment=segment)
+    tick("training: loading paths")
+    trainer: Any = make_trainer(settings, load_paths(settings), Logger(None, []))
+    series = section.add("PPO, --fast", "s/env-step of learning", n=settings.envs)
+    trainer.segment(0, lambda *_: None)
+    for number in range(1, settings.segments):
+        tick(f"training: PPO, round {number} of {effort.learning_rounds}")
+        began, before = time.perf_counter(), trainer.steps
+        trainer.segment(number, lambda *_: None)
+        series.rounds.append((time.perf_counter() - began) / (trainer.steps - before))

@@ -1,66 +1,76 @@
-"""Timing: rounds of several things in turn (A B A B ...), raw values kept, ratios round by round.
+"""Time several things in interleaved rounds (A B A B ...) and compare them round by round.
 
 A machine's speed drifts with its load and clock, by tens of per cent and for seconds at a time. Two
-things timed one after the other differ by that drift; round k of one against round k of the other,
-taken within a moment, do not, and the spread of those ratios shows what noise is left.
+things timed one after the other differ by that drift. Round k of one and round k of the other are
+taken within a moment of each other, so the drift cancels in their ratio, and the spread of the
+ratios shows the noise that is left.
 """
 
-import time
-from collections.abc import Callable, Iterable, Sequence
+import importlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 Run = Callable[[int], float]
-"""Does something a number of times and returns the seconds it took, set-up excluded."""
+"""Repeats some work a number of times and returns the seconds that it took, without set-up."""
 Round = Callable[[], float]
-"""One round: the value that it measured, for one time of what is done."""
+"""Measures one round and returns the value per repetition."""
 Tick = Callable[[str], None]
-"""Told what is being measured now."""
+"""Receives the name of the current measurement for the progress bar."""
 
 SHORTEST = 1e-7
-"""s, that a clock's reading is taken for at least."""
+"""Lower bound on a measured time in the denominator of a ratio, s."""
 PREDICT = "s/predict"
 COLD_START = "s/predict, first of an episode"
 WINDOW_MEDIAN = "s/predict, median of a window"
-"""Unit of rounds that are medians themselves: for ratios, beside a series of every solve."""
+"""Unit of rounds that are medians themselves; ratios of solvers are computed from these."""
 MANY = 100
-"""Rounds from which on a 99th percentile says something."""
+"""Number of rounds from which on a 99th percentile is reported."""
+INSTALL = {
+    "highway_env": "pip install 'lpv-track-env[highway]'",
+    "stable_baselines3": "pip install 'lpv-track-env[rl]'",
+    "torch": "pip install 'lpv-track-env[rl]'",
+    "gymnax": "pip install gymnax",
+    "jax": "pip install gymnax",
+    "envpool": "pip install envpool",
+}
+"""Command that installs each optional package, by module."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured."""
+    """Amount of measuring."""
 
     rounds: int = 9
     round_seconds: float = 0.08
-    """About how long a round takes."""
+    """Approximate duration of a round, s."""
     sizes: tuple[int, ...] = (1, 4, 16, 64, 256, 1024, 4096, 16384)
     """Numbers of environments stepped together."""
     threads: tuple[int, ...] = (1, 2)
     learning_rounds: int = 3
     learning_steps: int = 4096
-    """Env-steps of a round of PPO, over all its environments."""
+    """Environment steps in a round of PPO, over all its environments."""
     trajectories: tuple[str, ...] = ("T2", "T4")
     window: int = 60
-    """Control periods in a row that solvers are given."""
+    """Consecutive control periods in a window of observations for the solvers."""
     windows: int = 4
-    """Windows a trajectory, evenly along it."""
+    """Windows per trajectory, evenly spaced along it."""
     repeats: int = 2
-    """Times that every solver solves every window."""
+    """Number of times that every solver solves every window."""
     horizons: tuple[int, ...] = (10, 20, 30, 40, 50)
     batches: tuple[int, ...] = (1, 4, 16, 64, 256, 1024)
     wild: int = 6000
-    """Wild observations for each vehicle."""
+    """Random observations per vehicle in the section `wild`."""
     frames: int = 5000
-    """Frames of a drive that are drawn at most."""
+    """Largest number of frames to draw."""
     processes: int = 3
-    """Fresh processes of a kind."""
+    """Fresh processes per program."""
     cold: bool = True
-    """Whether processes with an empty numba cache are measured, 10 s and more each."""
+    """Whether to start processes with an empty numba cache too, at 10 s and more each."""
     large: int = 4096
-    """Environments of the vector env whose memory is measured."""
+    """Environments in the vector environment whose memory is measured."""
 
 
 FULL = Effort()
@@ -73,7 +83,7 @@ QUICK = Effort(
 
 @dataclass
 class Series:
-    """Rounds of one thing, each a value in `unit`, and what it was made with."""
+    """Rounds of one measurement in `unit`, and the settings that they were taken with."""
 
     name: str
     unit: str
@@ -81,7 +91,7 @@ class Series:
     rounds: list[float] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything, with the median, least and greatest round."""
+        """All fields, with the statistics of the rounds."""
         return {
             "name": self.name,
             "unit": self.unit,
@@ -99,7 +109,7 @@ class Comparison:
     other: Series
 
     def as_dict(self) -> dict[str, Any]:
-        """Both names and settings, the ratio of each round, their median, least and greatest."""
+        """Names and settings of both series, the ratio of each round, and its statistics."""
         # An interrupted run has the last round of some series only.
         pairs = zip(self.ours.rounds, self.other.rounds, strict=False)
         rounds = [other / max(ours, SHORTEST) for ours, other in pairs]
@@ -115,7 +125,7 @@ class Comparison:
 
 @dataclass
 class Section:
-    """What one section measured, and what it could not. Filled as it goes, so it may be cut off."""
+    """Measurements of one section, filled as they are taken, so that an interrupt keeps them."""
 
     title: str
     notes: list[str] = field(default_factory=list)
@@ -130,17 +140,27 @@ class Section:
         return series
 
     def compare(self, ours: Series, other: Series) -> None:
-        """Have the ratio other / ours worked out."""
+        """Report the ratio other / ours."""
         self.comparisons.append(Comparison(ours, other))
 
-    def lacks(self, name: str, reason: str) -> None:
-        """Note what cannot be measured here, once."""
+    def leave_out(self, name: str, reason: str) -> None:
+        """Note once that something cannot be measured here."""
         note = {"name": name, "reason": reason}
         if note not in self.unavailable:
             self.unavailable.append(note)
 
+    def available(self, factories: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
+        """Call the factories and return the results by name, noting those that are unavailable."""
+        made = {}
+        for name, factory in factories.items():
+            try:
+                made[name] = factory()
+            except Unavailable as reason:
+                self.leave_out(name, str(reason))
+        return made
+
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; what has no round yet is left out."""
+        """Plain values for JSON, without series that have no round yet."""
         return {
             "title": self.title,
             "notes": list(self.notes),
@@ -155,7 +175,7 @@ class Section:
 
 
 def summary(rounds: Sequence[float]) -> dict[str, float]:
-    """Median, least and greatest, of many the 99th percentile too; empty without rounds."""
+    """Median, minimum and maximum, and from `MANY` rounds on the 99th percentile; {} if empty."""
     if not rounds:
         return {}
     found = {"median": np.median(rounds), "min": np.min(rounds), "max": np.max(rounds)}
@@ -164,10 +184,11 @@ def summary(rounds: Sequence[float]) -> dict[str, float]:
     return {name: float(value) for name, value in found.items()}
 
 
-def calibrated(run: Run, seconds: float) -> Round:
-    """A round of about `seconds`: the number of times is found here.
+def calibrated(run: Run, seconds: float, items: int = 1) -> Round:
+    """Return a round of about `seconds`, with the number of repetitions found here.
 
-    The first time of all is not counted on: it may compile.
+    A round's value is the time of one repetition divided by `items`, the number of things that a
+    repetition does at once. The first call is not timed, since it may compile.
     """
     run(1)
     count, took = 1, run(1)
@@ -175,19 +196,32 @@ def calibrated(run: Run, seconds: float) -> Round:
         count *= 2
         took = run(count)
     count = max(round(count * seconds / took), 1)
-    return lambda: run(count) / count
+    return lambda: run(count) / count / items
 
 
 def interleave(pairs: Iterable[tuple[Series, Round]], rounds: int) -> None:
-    """Measure rounds of each in turn, A B C A B C ..., into their series."""
+    """Measure the rounds of all series in turn, A B C A B C ..."""
     pairs = list(pairs)
     for _ in range(rounds):
-        for series, once in pairs:
-            series.rounds.append(once())
+        for series, measure_round in pairs:
+            series.rounds.append(measure_round())
 
 
-def clock(work: Callable[[], object]) -> float:
-    """Seconds that some work takes."""
-    began = time.perf_counter()
-    work()
-    return time.perf_counter() - began
+class Unavailable(Exception):  # noqa: N818  reported as a note, not as an error
+    """Something that cannot be measured here, with the reason in one line."""
+
+
+def module(name: str) -> Any:
+    """Import a module of an optional package.
+
+    Raises
+    ------
+    Unavailable
+        With the command that installs the package.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        missing = (error.name or name).partition(".")[0]
+        hint = INSTALL.get(missing, f"pip install {missing}")
+        raise Unavailable(f"{missing} is not installed: {hint}") from error

@@ -1,8 +1,8 @@
-"""The step of the vector environment as a NumPy user would write it: all environments at once.
+"""The vector environment written with NumPy: the comparison for the compiled kernels.
 
-The yardstick of the compiled kernels: the same model, substeps, projection, preview and reward, in
-array operations over environments, and for the preview over environments and nodes. It uses the
-project's own vector field, and none of its compiled functions.
+Model, substeps, projection, preview and reward are the same, as array operations over all
+environments (the preview: over environments and nodes). The vector field is shared; none of the
+project's compiled functions is used.
 """
 
 import math
@@ -23,21 +23,21 @@ NEWTON_STEPS = 4
 
 
 class NumpyTracking:
-    """Episodes of path tracking, stepped in NumPy; none is reset.
+    """Episodes of path tracking stepped in NumPy, without resets.
 
     Parameters
     ----------
     task
-        What all of them drive.
+        The driving task of all episodes.
     records
-        (n, `kernels.RECORD_SIZE`), as a `PathTrackingVectorEnv` holds them; copied.
+        (n, `kernels.RECORD_SIZE`), as in a `PathTrackingVectorEnv`; copied.
 
     Attributes
     ----------
     state
-        (6, n), as `bicycle` orders it.
+        (6, n), in the order of `bicycle`.
     arc_length, lateral_error, heading_error, speed_error
-        (n,) of the last step, m, m, rad, m/s.
+        (n,) at the last step, m, m, rad, m/s.
     """
 
     def __init__(self, task: Task, records: Array) -> None:
@@ -59,7 +59,7 @@ class NumpyTracking:
         self._bound = task.layout.bound
 
     def step(self, actions: Array) -> tuple[NDArray[np.float32], Array, Any, Any]:
-        """One control period with actions (n, 2): observations, rewards, terminated, truncated."""
+        """Step with actions (n, 2); return observations, rewards, terminated, truncated."""
         last, before = self._command, self.arc_length
         self._command = self._actuate(actions.T)
         self.state = self._integrate(self.state, self._command)
@@ -106,14 +106,14 @@ class NumpyTracking:
         return x
 
     def _cell(self, s: Array) -> tuple[NDArray[np.int64], Array, Array]:
-        """Cell, share u of it, and laps before it, for arc lengths of any shape."""
+        """Return cell, fraction u within it, and completed laps, for arc lengths of any shape."""
         laps = np.floor(s / self._length) if self._closed else np.zeros_like(s)
         inside = np.clip(s - laps * self._length, 0.0, self._length)
         index = np.minimum((inside / self._h).astype(np.int64), self._cells - 1)
         return index, inside / self._h - index, laps
 
     def _cubic(self, values: Array, slopes: Array, index: Any, u: Array) -> tuple[Array, ...]:
-        """Value and two derivatives (in u) of the Hermite cubic of the nodes' values, slopes."""
+        """Return value and first two derivatives (in u) of the Hermite cubic through the nodes."""
         a, b = values[index], values[index + 1]
         ma, mb = self._h * slopes[index], self._h * slopes[index + 1]
         c2, c3 = 3.0 * (b - a) - 2.0 * ma - mb, ma + mb - 2.0 * (b - a)
@@ -190,7 +190,7 @@ class NumpyTracking:
         return np.clip(values, -self._bound, self._bound).astype(np.float32)
 
     def _preview(self) -> tuple[Array, Array]:
-        """Mean curvatures and speeds of the next nodes of the reference's own time, (n, K) each."""
+        """Return mean curvature before, and speed at, the next K nodes in time, (n, K) each."""
         index, u, laps = self._cell(self.arc_length)
         speed = self._speed_at(index, u)
         now = self._time[index] + 2.0 * u * self._h / (self._speed[index] + speed)

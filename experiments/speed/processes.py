@@ -1,7 +1,7 @@
-"""Sections of fresh processes: how much memory they take, and how soon they have begun.
+"""Sections of fresh processes: peak memory, and time from the start to the first result.
 
-Each is a child with its own interpreter that does one thing and reports; the clock runs from before
-it is started.
+Each measurement starts a child process that does one thing and reports; the clock starts before the
+child.
 """
 
 import json
@@ -13,11 +13,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from experiments.speed.measure import Effort, Section, Series, Tick
+from experiments.speed.measure import Effort, Section, Series, Tick, Unavailable
 
 LIMIT = 300.0
-"""s, after which a child is given up."""
-# Peak resident set of this program: ru_maxrss also remembers the parent that it was forked from.
+"""Time limit of a child process, s."""
+# VmHWM is the peak of this program alone; ru_maxrss also covers the parent before the fork.
 REPORT = """
 import json, resource, sys, time
 done = time.time()
@@ -44,12 +44,12 @@ env.reset(seed=0)
 env.step(np.zeros(({n}, 2), dtype=np.float32))
 """
 INTERPRETER = ("bare interpreter", "import lpv_track_env")
-"""These compile nothing."""
+"""Programs that compile nothing."""
 IPOPT, NMPC, VECTOR_ENV = "first solve of lpv-nmpc-ipopt", "first solve of lpv-nmpc", "vector env"
 
 
 def programs(large: int) -> dict[str, str]:
-    """What the children run, by what they show."""
+    """Return the programs of the child processes by name, with `large` vector environments."""
     return {
         "bare interpreter": "",
         "import lpv_track_env": "import lpv_track_env\n",
@@ -61,19 +61,15 @@ def programs(large: int) -> dict[str, str]:
     }
 
 
-class ChildFailed(Exception):  # noqa: N818  not an error: said, and gone on
-    """A child that did not report, with the last line it said."""
-
-
 def child(program: str, cache: Path | None = None) -> tuple[float, float]:
-    """Seconds until a fresh process has run a program, and its peak resident set in bytes.
+    """Return the seconds until a fresh process has run a program, and its peak memory in bytes.
 
-    `cache` is a folder for numba's cache instead of the usual one.
+    `cache` replaces the folder of numba's cache.
 
     Raises
     ------
-    ChildFailed
-        If it does not end well.
+    Unavailable
+        If the process fails, with the last line of its error output.
     """
     environment = dict(os.environ)
     if cache is not None:
@@ -85,17 +81,17 @@ def child(program: str, cache: Path | None = None) -> tuple[float, float]:
             env=environment, capture_output=True, text=True, timeout=LIMIT, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        raise ChildFailed(f"not done within {LIMIT:.0f} s") from None
+        raise Unavailable(f"not done within {LIMIT:.0f} s") from None
     if ended.returncode != 0:
         said = ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"]
-        raise ChildFailed(said[-1])
+        raise Unavailable(said[-1])
     report: dict[str, Any] = json.loads(ended.stdout.strip().splitlines()[-1])
     return report["done"] - began, float(report["peak"])
 
 
 def memory(section: Section, effort: Effort, tick: Tick) -> None:
-    """Peak resident set of fresh processes, and bytes per environment of a vector env."""
-    section.notes.append("Peak resident set of a fresh process that does this and no more.")
+    """Measure peak memory of fresh processes, and bytes per environment of a vector env."""
+    section.notes.append("Peak resident set of a fresh process that does this alone.")
     peaks: dict[str, Series] = {}
     for name, program in programs(effort.large).items():
         peaks[name] = section.add(name, "bytes")
@@ -103,8 +99,8 @@ def memory(section: Section, effort: Effort, tick: Tick) -> None:
         try:
             for _ in range(effort.processes):
                 peaks[name].rounds.append(child(program)[1])
-        except ChildFailed as reason:
-            section.lacks(name, str(reason))
+        except Unavailable as reason:
+            section.leave_out(name, str(reason))
     one = peaks.get(f"{VECTOR_ENV} of 1")
     many = peaks.get(f"{VECTOR_ENV} of {effort.large}")
     if one is not None and many is not None:
@@ -116,7 +112,7 @@ def memory(section: Section, effort: Effort, tick: Tick) -> None:
 
 
 def startup(section: Section, effort: Effort, tick: Tick) -> None:
-    """Wall time from starting a process to its first step or solve."""
+    """Measure the wall time from starting a process to its first step or solve."""
     section.notes.append(
         "Seconds from starting a process until this is done. Warm: compiled code is in numba's "
         "cache; cold: that cache is an empty folder, as on the first use after an installation."
@@ -126,7 +122,7 @@ def startup(section: Section, effort: Effort, tick: Tick) -> None:
     for name, program in possible.items():
         try:
             tick(f"start-up: {name}, warm")
-            child(program)  # whatever was not yet compiled is now
+            child(program)  # fills numba's cache
             warm = section.add(name, "s", cache="warm")
             for _ in range(effort.processes):
                 warm.rounds.append(child(program)[0])
@@ -135,5 +131,5 @@ def startup(section: Section, effort: Effort, tick: Tick) -> None:
                 cold = section.add(name, "s", cache="cold")
                 with tempfile.TemporaryDirectory() as cache:
                     cold.rounds.append(child(program, Path(cache))[0])
-        except ChildFailed as reason:
-            section.lacks(name, str(reason))
+        except Unavailable as reason:
+            section.leave_out(name, str(reason))

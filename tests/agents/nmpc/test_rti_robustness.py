@@ -8,7 +8,7 @@ import pytest
 from agents.nmpc.problem import Status
 from agents.weights import TrackingWeights
 from experiments.run.suites import PAPER_VEHICLES
-from experiments.speed.wild import wild_observations
+from experiments.speed.solvers import wild_observations
 from tests.helpers.driven_vehicles import drives, environment, made
 from tests.helpers.nmpc_situations import WEIGHTS
 

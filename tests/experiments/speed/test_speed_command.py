@@ -1,5 +1,6 @@
 """`lpv-track speed`: what it writes, how its ratios are made, what it says when something lacks."""
 
+import importlib
 import json
 import resource
 import signal
@@ -17,8 +18,9 @@ from rich.text import Text
 import agents
 import trajectories
 from experiments import cli
-from experiments.speed import command, environments, figures, peers, processes, solvers, tables
-from experiments.speed.command import SECTIONS
+from experiments.commands.options import EXIT_INTERRUPTED
+from experiments.commands.speed import FORMAT, SECTIONS
+from experiments.speed import display, environments, measure, processes, solvers
 from experiments.speed.measure import (
     COLD_START,
     FULL,
@@ -29,6 +31,7 @@ from experiments.speed.measure import (
     Section,
     Series,
     Tick,
+    Unavailable,
     calibrated,
     interleave,
 )
@@ -59,7 +62,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shown(result: dict[str, Any]) -> str:
     console = Console(width=200)
     with console.capture() as capture:
-        tables.show(result, console)
+        display.show(result, console)
     return capture.get()
 
 
@@ -68,7 +71,7 @@ def shown(result: dict[str, Any]) -> str:
 
 def test_the_json_holds_every_round_the_machine_and_the_settings(tiny: Path) -> None:
     result = read(tiny)
-    assert result["format"] == command.FORMAT
+    assert result["format"] == FORMAT
     assert result["complete"] is True
     assert list(result["sections"]) == MEASURED
     assert result["settings"]["rounds"] == QUICK.rounds
@@ -127,7 +130,7 @@ def test_solvers_are_timed_solve_by_solve(tiny: Path) -> None:
 
 def test_the_picture_is_a_png(tiny: Path) -> None:
     assert (tiny / "speed.png").read_bytes().startswith(b"\x89PNG\r\n")
-    assert figures.picture({"sections": {}, "machine": {}}) is None
+    assert display.figure_of({"sections": {}, "machine": {}}) is None
 
 
 def test_tables_show_every_series_and_how_busy_the_machine_was(tiny: Path) -> None:
@@ -137,7 +140,7 @@ def test_tables_show_every_series_and_how_busy_the_machine_was(tiny: Path) -> No
         assert section["title"] in text
         for series in section["series"]:
             if series["unit"] != WINDOW_MEDIAN:
-                assert tables.quantity(series["median"], series["unit"]) in text
+                assert display.quantity(series["median"], series["unit"]) in text
     assert "load average over a minute" in text
     assert result["machine"]["processor"] in text
     ratio = result["sections"]["single"]["ratios"][0]
@@ -148,12 +151,12 @@ def test_a_setting_of_some_series_makes_no_rows_of_it() -> None:
     section = Section("Memory")
     section.add("one", "bytes").rounds.append(3.0)
     section.add("each", "bytes", n=64).rounds.append(5.0)
-    table = tables.section_table(section.as_dict())
+    table = display.section_table(section.as_dict())
     assert list(table.columns[0].cells) == [Text("one"), Text("each, n 64")]
     for n in (1, 4):
         section.add("grows", "bytes", n=n).rounds.append(1.0)
     section.series = section.series[2:]
-    table = tables.section_table(section.as_dict())
+    table = display.section_table(section.as_dict())
     assert [list(column.cells) for column in table.columns] == [["1", "4"], ["1 B", "1 B"]]
 
 
@@ -162,9 +165,9 @@ def test_a_busy_machine_is_said_to_be() -> None:
         "processor": "P", "cores": 2, "load_average_before": [1.5, 0, 0],
         "load_average_after": [2.0, 0, 0],
     }  # fmt: skip
-    assert "was busy before" in tables.load({"machine": machine})
+    assert "was busy before" in display.load({"machine": machine})
     machine["load_average_before"] = [0.2, 0, 0]
-    assert "was busy before" not in tables.load({"machine": machine})
+    assert "was busy before" not in display.load({"machine": machine})
 
 
 @pytest.mark.parametrize(
@@ -181,7 +184,7 @@ def test_a_busy_machine_is_said_to_be() -> None:
     ],
 )
 def test_quantities(value: float, unit: str, text: str) -> None:
-    assert tables.quantity(value, unit) == text
+    assert display.quantity(value, unit) == text
 
 
 # What lacks, and what goes wrong -------------------------------------------------------------
@@ -206,8 +209,8 @@ def test_every_optional_package_is_told_how_to_be_had(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(peers.Unavailable, match=f"{name} is not installed: pip install"):
-        peers.module(name)
+    with pytest.raises(Unavailable, match=f"{name} is not installed: pip install"):
+        measure.module(name)
 
 
 def test_an_unknown_section_is_refused_in_one_line(
@@ -219,18 +222,17 @@ def test_an_unknown_section_is_refused_in_one_line(
     assert all(name in said for name in SECTIONS)
 
 
-def test_the_help_names_every_section(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(["speed", "--help"])
-    said = capsys.readouterr().out
-    assert all(name in said for name in SECTIONS)
+@pytest.mark.parametrize("name", SECTIONS)
+def test_every_section_has_its_function(name: str) -> None:
+    module, _ = SECTIONS[name]
+    assert callable(getattr(importlib.import_module(f"experiments.speed.{module}"), name))
 
 
 @pytest.mark.parametrize("swallowed", [False, True])
 def test_ctrl_c_keeps_what_was_measured(
     swallowed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def measure(section: Section, _effort: Any, tick: Tick) -> None:
+    def measure_one(section: Section, _effort: Any, tick: Tick) -> None:
         series = section.add("something", "s/step")
         series.rounds.append(1.5)
         try:
@@ -243,8 +245,8 @@ def test_ctrl_c_keeps_what_was_measured(
         series.rounds.append(2.5)
 
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setitem(SECTIONS, "single", ("One", measure))
-    assert speed(tmp_path, "--only", "single", "vector") == cli.EXIT_INTERRUPTED
+    monkeypatch.setattr(environments, "single", measure_one)
+    assert speed(tmp_path, "--only", "single", "vector") == EXIT_INTERRUPTED
     result = read(tmp_path)
     assert result["complete"] is False
     assert list(result["sections"]) == ["single"]
@@ -372,7 +374,7 @@ def test_rows_of_a_batch_follow_the_recording_each_from_its_place() -> None:
             seen.append(observation[:, 0].tolist())
 
     stream = np.arange(8, dtype=np.float32)[:, None]
-    run = solvers._batch_run(Agent(), stream, 4)  # type: ignore[arg-type]
+    run = solvers.batch_run(Agent(), stream, 4)  # type: ignore[arg-type]
     assert run(2) > 0
     run(1)
     assert seen == [[0, 2, 4, 6], [1, 3, 5, 7], [2, 4, 6, 0], [3, 5, 7, 1]]
@@ -397,7 +399,7 @@ def test_a_childs_clock_runs_from_before_it_starts() -> None:
 
 
 def test_a_child_that_fails_says_its_last_line() -> None:
-    with pytest.raises(processes.ChildFailed, match="ValueError: no luck"):
+    with pytest.raises(Unavailable, match="ValueError: no luck"):
         processes.child("raise ValueError('no luck')\n")
 
 
@@ -442,10 +444,10 @@ def test_the_full_effort_is_more_than_the_quick_one_everywhere() -> None:
 
 def test_the_share_of_learning_is_the_vecenvs() -> None:
     pytest.importorskip("stable_baselines3")
-    from experiments.speed import learning
+    from experiments.speed import loops
 
     section = Section("learning")
-    learning.learning(section, QUICK, quietly)
+    loops.learning(section, QUICK, quietly)
     found = {(series.name, series.unit): series.rounds for series in section.series}
     shares = found["DummyVecEnv of single ones", "share of wall time"]
     assert len(shares) == QUICK.learning_rounds
