@@ -1,1 +1,1 @@
-"""`lpv-track verify`: the real-time solver against independent solvers, models and derivatives."""
+"""Measures of `lpv-track verify`: the real-time solver against independent oracles."""

@@ -1,33 +1,144 @@
-"""One situation, measured: the real-time solver's linearisation, QP and optimum against oracles."""
+"""Draw situations and measure the real-time solver in each of them against the oracles."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Protocol
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.base import DrivingTask
+from agents.nmpc.casadi_solver import CasadiSolver
 from agents.nmpc.fatrop_solver import FatropSolver
+from agents.nmpc.ipopt_agent import IpoptNmpc
 from agents.nmpc.problem import NmpcProblem, Solution, Status
+from agents.reference import steady_turn
 from agents.registry import agent_class
-from experiments.verify.cost import PlanCost, plan_cost
-from experiments.verify.derivatives import CasadiDerivatives, Derivatives
-from experiments.verify.qp import PiqpOracle
-from experiments.verify.situations import Sampler, Situation
-from experiments.verify.verdict import SAME
+from agents.weights import TrackingWeights
+from experiments.run.suites import PAPER_VEHICLES, SIX
+from experiments.verify.oracles import (
+    CasadiDerivatives,
+    Derivatives,
+    PiqpOracle,
+    PlanCost,
+    plan_cost,
+)
+from lpv_track_env.registration import PATH_TRACKING
+from trajectories import load
 
 Array = NDArray[np.float64]
 Measures = dict[str, float | None]
 
-FATROP_TOLERANCE = 1e-7
+IPOPT_TOLERANCE, FATROP_TOLERANCE = 1e-8, 1e-7
 ITERATIONS = 200
-"""Bound on the iterations after which the solver must have converged."""
+"""Iterations after which the solver must have converged."""
 FATROP_EVERY = 5
-"""Of each vehicle's situations, those that fatrop solves too."""
+"""fatrop solves one in this many of each vehicle's situations."""
+SAME = 1e-6
+"""Relative difference of cost up to which two plans count as the same optimum."""
+ERRORS = {"lateral_error": 0.5, "heading_error": 0.1, "speed_error": 1.0}
+"""Half widths of the uniform initial errors, m, rad, m/s."""
+WEIGHT_DECADES = 1.0
+"""Half width in decades of the log-uniform factors on the weights, in half of the situations."""
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Arguments of one solve, as `solve` takes them, and inputs to linearise along."""
+
+    index: int
+    trajectory: str
+    vehicle: str
+    state: Array
+    """(6,)."""
+    last_input: Array
+    """(2,)."""
+    reference: Array
+    """(N + 1, 4)."""
+    weights: Array
+    """(10,)."""
+    inputs: Array
+    """(N, 2), within all hard bounds."""
+
+    @property
+    def parameters(self) -> tuple[Array, Array, Array, Array]:
+        """State, last input, reference, weights."""
+        return self.state, self.last_input, self.reference, self.weights
+
+
+def kind(index: int) -> tuple[str, str]:
+    """Return trajectory and vehicle of a situation; indices run through all pairs."""
+    count = len(PAPER_VEHICLES)
+    return SIX[index // count % len(SIX)], PAPER_VEHICLES[index % count]
+
+
+class Sampler:
+    """Draws situations of one vehicle, each determined by its index and the seed alone.
+
+    Its `agent`, the NMPC by IPOPT, converts observations to the solvers' arguments; `ipopt` is that
+    agent's solver.
+    """
+
+    def __init__(self, vehicle: str) -> None:
+        self.vehicle = vehicle
+        self.env = gymnasium.make(PATH_TRACKING, trajectory=SIX[0], vehicle=vehicle)
+        self.agent = IpoptNmpc(DrivingTask.of(self.env), tolerance=IPOPT_TOLERANCE)
+        assert isinstance(self.agent.solver, CasadiSolver)
+        self.ipopt = self.agent.solver
+
+    def draw(self, index: int, seed: int) -> Situation:
+        """Draw the situation of an index."""
+        trajectory, vehicle = kind(index)
+        assert vehicle == self.vehicle
+        rng = np.random.default_rng([seed, index])
+        problem, layout = self.agent.problem, self.agent.task.layout
+        options: dict[str, Any] = {
+            "trajectory": trajectory,
+            **{name: rng.uniform(-half, half) for name, half in ERRORS.items()},
+        }
+        options["arc_length"] = rng.uniform(0.0, load(trajectory).length)
+        observation, _ = self.env.reset(options=options)
+        self._move(layout.slices, observation, rng)
+        state, last, reference = self.agent.situation(layout.unpack(observation))
+        weights = TrackingWeights().as_array()
+        if rng.random() < 0.5:
+            decades = rng.uniform(-WEIGHT_DECADES, WEIGHT_DECADES, len(weights))
+            weights = weights * 10.0**decades
+        low, high = problem.input_bounds
+        inputs, before = np.empty((problem.horizon, 2)), last
+        for i, step in enumerate(problem.input_steps):
+            inputs[i] = before = (before + rng.uniform(-1.0, 1.0, 2) * step).clip(low, high)
+        return Situation(index, trajectory, vehicle, state, last, reference, weights, inputs)
+
+    def _move(self, entries: dict[str, slice], observation: Any, rng: np.random.Generator) -> None:
+        """Give the vehicle a turning motion, since a reset leaves it going and steering straight.
+
+        In half of the cases it turns about as the path does, else its steering angle is anywhere
+        within its range.
+        """
+        car = self.agent.problem.vehicle
+        slowest = car.speed_range[0]
+        speed = max(float(observation[entries["longitudinal_speed"]][0]), slowest)
+        curvature = float(observation[entries["preview_curvature"]][0])
+        turn = steady_turn(curvature, speed, car)
+        steering = turn.steering_angle + rng.normal(0.0, 0.02)
+        if rng.random() < 0.5:
+            steering = rng.uniform(-car.max_steering_angle, car.max_steering_angle)
+        new = {
+            "longitudinal_speed": speed,
+            "lateral_speed": speed * turn.sideslip + rng.normal(0.0, 0.1),
+            "yaw_rate": turn.yaw_rate + rng.normal(0.0, 0.1),
+            "acceleration": rng.uniform(*car.longitudinal_acceleration_range),
+            "steering_angle": np.clip(steering, -car.max_steering_angle, car.max_steering_angle),
+        }
+        for name, value in new.items():
+            observation[entries[name]] = value
 
 
 class RealTimeSolver(Protocol):
-    """The solver under test, made by `cls(problem, iterations=...)`."""
+    """Solver under test, made by `cls(problem, iterations=...)`."""
 
     problem: NmpcProblem
     damping: tuple[float, float]
@@ -40,34 +151,36 @@ class RealTimeSolver(Protocol):
         weights: Array,
         warm: Any = None,
     ) -> tuple[Solution, Any]:
-        """Up to `iterations` iterations; as `CasadiSolver.solve`."""
+        """Do up to `iterations` iterations; as `CasadiSolver.solve`."""
         ...
 
     def linearise(self, state: Array, inputs: Array) -> Any:
-        """Roll the inputs (N, 2) out from a state (6,): a tuple with the fields of Derivatives."""
+        """Roll the inputs (N, 2) out from a state (6,); a tuple with the fields of Derivatives."""
         ...
 
     def solve_qp(
         self, state: Array, last_input: Array, reference: Array, weights: Array, inputs: Array
     ) -> tuple[Status, Array]:
-        """One QP, linearised along `inputs` (N, 2): its optimal inputs (N, 2)."""
+        """Solve one QP linearised along `inputs` (N, 2); return its optimal inputs (N, 2)."""
         ...
 
 
 class Bench:
-    """Solvers and oracles for one vehicle.
+    """Solver under test and oracles for one vehicle.
 
     Parameters
     ----------
     vehicle
-        A preset's name.
+        Name of a preset.
     solver
         "module:Class" (or "file.py:Class") of the solver under test.
 
     Raises
     ------
     ValueError
-        If the solver, or an oracle, is not there.
+        If the solver cannot be loaded.
+    ModuleNotFoundError
+        If an oracle is not installed.
     """
 
     def __init__(self, vehicle: str, solver: str) -> None:
@@ -82,9 +195,9 @@ class Bench:
         self.fatrop = FatropSolver(problem, tolerance=FATROP_TOLERANCE)
 
     def measure(self, situation: Situation, *, fatrop: bool) -> Measures:
-        """All measures of one situation; None where an oracle gave no answer.
+        """Return all measures of one situation.
 
-        A solver under test that fails is infinitely wrong.
+        A measure is None if its oracle has no answer, and infinite if the solver under test failed.
         """
         along = self.derivatives.along(situation.state, situation.inputs)
         return {
@@ -94,12 +207,14 @@ class Bench:
         }
 
     def _linearisation(self, situation: Situation, along: Derivatives) -> Measures:
+        """Compare the roll-out and its derivatives with CasADi's."""
         ours = self.one_step.linearise(situation.state, situation.inputs)
         return {
             name: scaled_error(getattr(ours, name), getattr(along, name)) for name in along._fields
         }
 
     def _qp(self, situation: Situation, along: Derivatives) -> Measures:
+        """Compare the optimal inputs of one QP with PIQP's."""
         state, last, reference, weights = situation.parameters
         theirs = self.piqp.solve(last, reference, weights, situation.inputs, along)
         if theirs is None:
@@ -113,11 +228,12 @@ class Bench:
         }
 
     def _optimum(self, situation: Situation, *, fatrop: bool) -> Measures:
+        """Compare the converged plan with IPOPT's, and with fatrop's if it is to be run."""
         ours, _ = self.converged.solve(*situation.parameters)
         step, _ = self.one_step.solve(*situation.parameters)
         ipopt, _ = self.ipopt.solve(*situation.parameters)
-        plan = self._price(ours, situation)
-        best = self._price(ipopt, situation)
+        plan = self._cost(ours, situation)
+        best = self._cost(ipopt, situation)
         measures: Measures = {
             "excess": None if plan is None else plan.excess,
             "cost_error": relative(plan, best),
@@ -137,15 +253,15 @@ class Bench:
             measures["one_step_first_input"] = largest(step.inputs[0] - ours.inputs[0])
         if fatrop:
             other, _ = self.fatrop.solve(*situation.parameters)
-            third = self._price(other, situation)
+            third = self._cost(other, situation)
             measures["fatrop_cost_error"] = relative(plan, third)
             measures["oracles_cost_error"] = None if third is None else relative(third, best)
             measures["fatrop_iterations"] = float(other.iterations)
             measures["fatrop_seconds"] = other.seconds
         return measures
 
-    def _price(self, solution: Solution, situation: Situation) -> PlanCost | None:
-        """Price of a solution's plan; None unless it was solved."""
+    def _cost(self, solution: Solution, situation: Situation) -> PlanCost | None:
+        """Return the cost of a solution's plan, or None if the solver failed."""
         if solution.status is not Status.SUCCESS or solution.inputs is None:
             return None
         return plan_cost(self.problem, *situation.parameters, solution.inputs)
@@ -153,36 +269,36 @@ class Bench:
     def _suboptimality(
         self, ours: Solution, plan: PlanCost | None, best: PlanCost | None, situation: Situation
     ) -> float | None:
-        """By how much of its cost IPOPT betters our plan when it starts there; >= 0.
+        """Return the relative reduction of cost, >= 0, that IPOPT achieves from our plan.
 
-        The problem is not convex: a plan that costs more than IPOPT's may be an optimum of its own,
-        and then IPOPT keeps it. Where both cost the same already, it is not asked.
+        The problem is not convex: a plan that costs more than IPOPT's may be another local optimum,
+        at which IPOPT then stays. IPOPT is not run again if both costs are the same.
         """
         if plan is None:
             return np.inf
         error = relative(plan, best)
         if error is not None and abs(error) <= SAME:
             return max(error, 0.0)
-        polished = self._price(self.ipopt.solve_from(ours, *situation.parameters), situation)
+        polished = self._cost(self.ipopt.solve_from(ours, *situation.parameters), situation)
         gain = relative(plan, polished)
         return None if gain is None else max(gain, 0.0)
 
 
 def largest(difference: Array) -> float:
-    """Largest magnitude; infinite if any entry is not finite."""
+    """Return the largest magnitude, infinite if any entry is not finite."""
     value = float(np.abs(difference).max())
     return value if np.isfinite(value) else np.inf
 
 
 def scaled_error(ours: Array, theirs: Array) -> float:
-    """Largest difference, relative to entries above 1 and absolute below."""
+    """Return the largest difference, relative for entries above 1 and absolute below."""
     if np.shape(ours) != np.shape(theirs):
         raise ValueError(f"shape {np.shape(ours)} where {np.shape(theirs)} is due")
     return largest((ours - theirs) / np.maximum(1.0, np.abs(theirs)))
 
 
 def relative(ours: PlanCost | None, theirs: PlanCost | None) -> float | None:
-    """(ours - theirs) / theirs; None without theirs, infinite without ours."""
+    """Return (ours - theirs) / theirs; None without theirs, infinite without ours."""
     if theirs is None:
         return None
     return np.inf if ours is None else (ours.cost - theirs.cost) / theirs.cost
@@ -190,7 +306,7 @@ def relative(ours: PlanCost | None, theirs: PlanCost | None) -> float | None:
 
 @cache
 def bench(vehicle: str, solver: str) -> Bench:
-    """A vehicle's bench, made once a process."""
+    """Return a vehicle's bench, made once per process."""
     return Bench(vehicle, solver)
 
 
@@ -202,5 +318,5 @@ def run_situation(spec: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def situation_death(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Result of a situation that killed its worker twice."""
+    """Return the result of a situation whose worker process died twice."""
     return {**spec, "error": "the worker process died, twice", "measures": {}}

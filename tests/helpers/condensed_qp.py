@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.nmpc.problem import NmpcProblem
-from experiments.verify.derivatives import Derivatives
+from experiments.verify.oracles import Derivatives
 from lpv_track_env.bicycle import PSI, VX, VY, X, Y
 from tests.helpers.nmpc_situations import Situation
 

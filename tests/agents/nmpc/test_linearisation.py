@@ -9,8 +9,7 @@ from agents.nmpc.problem import NmpcProblem
 from agents.nmpc.rti_solver import RtiSolver
 from experiments.run.suites import PAPER_VEHICLES
 from experiments.verify.bench import scaled_error
-from experiments.verify.cost import rolled_out
-from experiments.verify.derivatives import CasadiDerivatives
+from experiments.verify.oracles import CasadiDerivatives, rolled_out
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES, VehicleParameters
 from tests.helpers.nmpc_situations import MIRROR_INPUT, MIRROR_STATE

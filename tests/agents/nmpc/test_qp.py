@@ -6,8 +6,7 @@ from numpy.typing import NDArray
 
 from agents.nmpc.problem import NmpcProblem, Status
 from agents.nmpc.rti_solver import RtiSolver
-from experiments.verify.derivatives import CasadiDerivatives
-from experiments.verify.qp import PiqpOracle
+from experiments.verify.oracles import CasadiDerivatives, PiqpOracle
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES, VehicleParameters
 from tests.helpers.condensed_qp import CondensedQp, excess, within
 from tests.helpers.nmpc_situations import MIRROR_INPUT, WEIGHTS, Situation, arc, hard

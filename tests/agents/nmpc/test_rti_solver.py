@@ -8,7 +8,7 @@ from agents.nmpc.casadi_solver import CasadiSolver
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.nmpc.rti_solver import RtiSolver
 from experiments.verify.bench import scaled_error
-from experiments.verify.cost import plan_cost, rolled_out
+from experiments.verify.oracles import plan_cost, rolled_out
 from lpv_track_env.bicycle import PSI, VX, X, Y
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES, VehicleParameters
 from tests.helpers.condensed_qp import excess

@@ -14,14 +14,25 @@ from agents.nmpc.casadi_solver import CasadiSolver, discrete_model
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.weights import TrackingWeights
 from experiments.cli import main
+from experiments.commands.verify import ROWS, SOLVER, shortfalls, summarise
 from experiments.run.suites import PAPER_VEHICLES
-from experiments.verify.bench import Bench, relative, scaled_error, situation_death
-from experiments.verify.command import SOLVER
-from experiments.verify.cost import PlanCost, plan_cost, rolled_out
-from experiments.verify.derivatives import CasadiDerivatives
-from experiments.verify.qp import PiqpOracle
-from experiments.verify.situations import ERRORS, Sampler, Situation, kind
-from experiments.verify.verdict import ROWS, shortfalls, summarise
+from experiments.verify.bench import (
+    ERRORS,
+    Bench,
+    Sampler,
+    Situation,
+    kind,
+    relative,
+    scaled_error,
+    situation_death,
+)
+from experiments.verify.oracles import (
+    CasadiDerivatives,
+    PiqpOracle,
+    PlanCost,
+    plan_cost,
+    rolled_out,
+)
 from lpv_track_env.vehicle import M2_MINIBUS
 from tests.helpers import stand_in_solver
 from tests.helpers.stand_in_solver import HeldInput, StandIn, WrongDerivative
