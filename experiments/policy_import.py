@@ -37,7 +37,7 @@ def run_import(options: argparse.Namespace, console: Any) -> int:
         options.preview_steps,
         period if options.preview_period is None else options.preview_period,
     )
-    from agents.learned.sb3 import load_trusted
+    from agents.learned.sb3_policies import load_trusted
 
     digest = ""
     if options.model.is_file():
@@ -81,7 +81,7 @@ def policy_of(
     ValueError
         If its observation or action space is that of another environment.
     """
-    from agents.learned.sb3 import from_sb3
+    from agents.learned.sb3_policies import from_sb3
 
     size = layout.size
     if np.shape(model.observation_space.low if _box(model.observation_space) else ()) != (size,):

@@ -1,35 +1,129 @@
-"""What Stable-Baselines3 learns on: scaled features and actions over the vector environments."""
+"""Environments that a policy learns on: scaled features and actions, as SB3's `VecEnv`."""
 
+import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
 
 from agents.base import DrivingTask
 from agents.delay import DelayMemory, NearFuture
-from agents.learned.policy import Policy
-from agents.learned.sb3 import from_sb3
-from agents.learned.scaling import Scaling, usual_scaling
-from agents.sb3 import TrackingVecEnv
+from agents.learned.policy import ORIGINS, Origin, Policy
+from agents.learned.sb3_policies import from_sb3
+from agents.sb3 import AdapterVecEnv, TrackingVecEnv
+from lpv_track_env.observation import ACCELERATION, PREVIEW_BOUNDS, SCALARS, STEERING_ANGLE
+from lpv_track_env.vehicle import VehicleParameters
+from trajectories.naming import choose
 
 Array = NDArray[Any]
 Infos = list[dict[str, Any]]
 
+LIMIT = 10.0
+"""Bound of the features; large errors saturate the finer of their two scales."""
+FINE = 10.0
+"""Ratio of the finer scale of an error to the coarser."""
+RESIDUAL_SHARE = 0.25
+"""Half width of a correction of the NMPC's action, as a share of the whole action range."""
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Scaling of observations to features x, and of outputs u in [-1, 1] to actions.
+
+    x = clip(W o + b, -limit, limit) with o the observation in SI units, followed by the NMPC's
+    action if that is the origin; action = origin + centre + half u.
+    """
+
+    feature_weight: NDArray[np.float32]
+    """W, (features, inputs)."""
+    feature_bias: NDArray[np.float32]
+    """b, (features,)."""
+    feature_limit: float
+    origin: Origin
+    """Origin of actions: zero, the actuators' values, or the NMPC's action."""
+    centre: NDArray[np.float64]
+    """(2,) [m/s^2, rad]."""
+    half: NDArray[np.float64]
+    """(2,) [m/s^2, rad]."""
+
+    @property
+    def features(self) -> int:
+        """Number of features."""
+        return len(self.feature_bias)
+
+    def features_of(self, inputs: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Scale inputs (n, inputs) to features (n, features)."""
+        x = inputs.astype(np.float32) @ self.feature_weight.T + self.feature_bias
+        return np.clip(x, -self.feature_limit, self.feature_limit, out=x)
+
+
+def usual_scaling(task: DrivingTask, origin: Origin = "actuators") -> Scaling:
+    """Return the scaling used in training, derived from the vehicle's ranges and the layout.
+
+    Preview speeds are relative to the reference speed; the vehicle's speed appears both relative
+    and absolute, lateral and heading error both coarse and fine. An action is an increment of the
+    actuators' values, at most what their rates allow in a control period; or, on top of the NMPC, a
+    correction within a part of the whole action range.
+    """
+    choose("origin", origin, ORIGINS)
+    car, layout = task.vehicle, task.layout
+    sharpest = math.tan(car.max_steering_angle) / car.wheelbase
+    accelerations = max(map(abs, car.acceleration_range))
+    rows: list[dict[str, float]] = [
+        {"longitudinal_speed": 0.1},
+        {"lateral_speed": 1.0},
+        {"yaw_rate": 1.0},
+        {"acceleration": 1.0 / accelerations},
+        {"steering_angle": 1.5 / car.max_steering_angle},
+        {"lateral_error": 2.0},
+        {"lateral_error": 2.0 * FINE},
+        {"heading_error": 4.0},
+        {"heading_error": 4.0 * FINE},
+        {"longitudinal_speed": 1.0, "reference_speed": -1.0},
+    ]
+    places = {name: k for k, (name, _, _) in enumerate(SCALARS)}
+    inputs = layout.size + (2 if origin == "lpv-nmpc" else 0)
+    weight = np.zeros((len(rows) + layout.preview_steps * len(PREVIEW_BOUNDS), inputs))
+    for row, entries in zip(weight, rows, strict=False):
+        for name, scale in entries.items():
+            row[places[name]] = scale
+    slices, first, k = layout.slices, len(rows), layout.preview_steps
+    weight[first : first + k, slices["preview_curvature"]] = np.eye(k) * (1.5 / sharpest)
+    weight[first + k :, slices["preview_speed"]] = np.eye(k)
+    weight[first + k :, places["reference_speed"]] = -1.0
+    if origin == "lpv-nmpc":
+        base = np.zeros((2, inputs))
+        base[0, -2], base[1, -1] = 1.0 / accelerations, 1.5 / car.max_steering_angle
+        weight = np.vstack([weight, base])
+    return Scaling(
+        weight.astype(np.float32), np.zeros(len(weight), dtype=np.float32), LIMIT, origin,
+        *_outputs(car, task.control_period, origin),
+    )  # fmt: skip
+
+
+def _outputs(car: VehicleParameters, period: float, origin: str) -> tuple[Array, Array]:
+    """Return centre and half width of the action range, (2,) [m/s^2, rad] each."""
+    low, high = car.acceleration_range
+    whole = np.array([0.5 * (high - low), car.max_steering_angle])
+    if origin == "zero":
+        return np.array([0.5 * (low + high), 0.0]), whole
+    if origin == "actuators":
+        return np.zeros(2), np.array([car.max_jerk, car.max_steering_rate]) * period
+    return np.zeros(2), RESIDUAL_SHARE * whole
+
 
 class _Part:
-    """Environments of one kind of conditions: what an agent there is shown, and what it sends."""
+    """Environments with the same conditions: observations and features of an agent, its actions."""
 
     def __init__(self, venv: TrackingVecEnv, scaling: Scaling, task: DrivingTask) -> None:
         self.venv, self.scaling = venv, scaling
         self.solves = 0
-        delayed = any(seconds > 0.0 for seconds in task.actuation)
-        self._future = NearFuture(task, task.actuation) if delayed else None
+        self._future = NearFuture(task, task.actuation) if task.delayed else None
         self._delays: DelayMemory | None = None
         self._base = None
         if scaling.origin == "lpv-nmpc":
@@ -37,84 +131,95 @@ class _Part:
 
             self._base = RtiNmpc(task)
         self._base_memory: Any = None
-        self.origin = np.zeros((venv.num_envs, 2))
-        self.seen = np.zeros((venv.num_envs, task.layout.size))
+        self.origins = np.zeros((venv.num_envs, 2))
+        self.observations = np.zeros((venv.num_envs, task.layout.size))
         space = venv.action_space
         assert isinstance(space, spaces.Box)
         self._low, self._high = space.low, space.high
 
     def begin(self, observations: Array) -> None:
-        """Take the first observations."""
+        """Take the first observations of all episodes."""
         n = len(observations)
         self._base_memory = None
         if self._future is not None:
             self._delays = self._future.memory(n)
-        self.look(observations, np.ones(n, dtype=np.bool_))
+        self.observe(observations, np.ones(n, dtype=np.bool_))
 
-    def look(self, observations: Array, starts: NDArray[np.bool_]) -> None:
-        """Note what agents are shown, and what their actions are an addition to."""
-        self.seen = np.array(observations, dtype=np.float64)
+    def observe(self, observations: Array, starts: NDArray[np.bool_]) -> None:
+        """Store the observations that agents are given, and the origins of their actions."""
+        self.observations = np.array(observations, dtype=np.float64)
         if self._future is not None and self._delays is not None:
-            self._future.look(self.seen, starts, self._delays)
-        self.origin, self._base_memory = self._origin_of(self.seen, self._base_memory, starts)
+            self._future.look(self.observations, starts, self._delays)
+        self.origins, self._base_memory = self._origins_of(
+            self.observations, self._base_memory, starts
+        )
 
-    def _origin_of(self, seen: Array, memory: Any, starts: Array | None) -> tuple[Array, Any]:
+    def _origins_of(
+        self, observations: Array, memory: Any, starts: Array | None
+    ) -> tuple[Array, Any]:
         if self._base is not None:
-            self.solves += len(seen)
-            return self._base.predict(seen, memory, starts)
+            self.solves += len(observations)
+            return self._base.predict(observations, memory, starts)
         if self.scaling.origin == "actuators":
-            return seen[:, 3:5], None
-        return np.zeros((len(seen), 2)), None
+            return observations[:, ACCELERATION : STEERING_ANGLE + 1], None
+        return np.zeros((len(observations), 2)), None
 
     def features(self) -> NDArray[np.float32]:
-        """What the learner is shown, (n, features)."""
-        return self._features(self.seen, self.origin)
+        """Return the learner's features, (n, features)."""
+        return self._features_of(self.observations, self.origins)
 
-    def _features(self, seen: Array, origin: Array) -> NDArray[np.float32]:
-        inputs = np.hstack([seen, origin]) if self._base is not None else seen
-        return self.scaling.of(inputs)
+    def _features_of(self, observations: Array, origins: Array) -> NDArray[np.float32]:
+        inputs = observations if self._base is None else np.hstack([observations, origins])
+        return self.scaling.features_of(inputs)
 
     def last_features(self, observation: Array, row: int) -> NDArray[np.float32]:
-        """Features (features,) of a last observation, before the row's next episode is noted."""
-        seen = np.array(observation, dtype=np.float64).reshape(1, -1)
+        """Return the features (features,) of a row's last observation, before its next episode."""
+        observations = np.array(observation, dtype=np.float64).reshape(1, -1)
         if self._future is not None and self._delays is not None:
             alone = self._future.memory(1)
             alone.commands[:] = self._delays.commands[row]
-            self._future.look(seen, np.zeros(1, dtype=np.bool_), alone)
-        # The row's own memory is the next episode's by now.
+            self._future.look(observations, np.zeros(1, dtype=np.bool_), alone)
+        # The row's own memory belongs to the next episode already.
         fresh = None if self._base is None else self._base.new_memory().memory
-        origin, _ = self._origin_of(seen, fresh, None)
-        features: NDArray[np.float32] = self._features(seen, origin)[0]
+        origins, _ = self._origins_of(observations, fresh, None)
+        features: NDArray[np.float32] = self._features_of(observations, origins)[0]
         return features
 
     def act(self, outputs: Array) -> NDArray[np.float32]:
-        """Actions (n, 2) in SI units for outputs (n, 2) in [-1, 1]; remembered as sent."""
+        """Turn outputs (n, 2) in [-1, 1] into actions (n, 2) in SI units, and note them as sent."""
         scaling = self.scaling
-        actions = self.origin + scaling.centre + scaling.half * np.clip(outputs, -1.0, 1.0)
+        actions = self.origins + scaling.centre + scaling.half * np.clip(outputs, -1.0, 1.0)
         sent: NDArray[np.float32] = np.clip(actions.astype(np.float32), self._low, self._high)
         if self._future is not None and self._delays is not None:
             self._future.note(self._delays, sent)
         return sent
 
 
-class LearnerVecEnv(VecEnv):
-    """Vector environments as a learner wants them: features and actions of about one.
+class LearnerVecEnv(AdapterVecEnv):
+    """Vector environments for learning: features and actions of magnitude one.
 
-    Observations are features of the observation that an agent of `agents.make` is shown (under
-    conditions with delays, that of the time at which its action lands), actions lie in [-1, 1];
-    both as `Scaling` says. Several vector environments, of different conditions say, are put one
-    after another.
+    Observations are features of what an agent of `agents.make` would be given (under conditions
+    with delays, the observation predicted to the time at which its action takes effect). Actions
+    lie in [-1, 1]. `Scaling` defines both. Several vector environments, for instance with different
+    conditions, are concatenated.
 
-    What learns sees the observation as it is; the policy that `policy_of` makes of it is symmetric,
-    so left and right are the same to it.
+    The learner sees the observation itself; the policy that `policy_of` makes is symmetric, so it
+    treats left and right alike.
 
     Parameters
     ----------
     venvs
-        Adapters over vector environments of one layout and control period, as
-        `agents.sb3_vec_env` makes them.
+        Adapters, made by `agents.sb3_vec_env`, over vector environments of one layout and control
+        period.
     scaling
-        By default `usual_scaling` of the first environment's task.
+        Default: `usual_scaling` of the first environment's task.
+
+    Raises
+    ------
+    TypeError
+        For another kind of environment.
+    ValueError
+        For none at all, or for different layouts or control periods.
     """
 
     def __init__(
@@ -138,47 +243,47 @@ class LearnerVecEnv(VecEnv):
         self._parts = [
             _Part(part, self.scaling, task) for part, task in zip(parts, tasks, strict=True)
         ]
-        counts = [part.num_envs for part in parts]
-        ends = np.cumsum([0, *counts]).tolist()
+        ends = np.cumsum([0, *(part.num_envs for part in parts)]).tolist()
         self._rows = [slice(a, b) for a, b in pairwise(ends)]
-        self._where = [(k, i) for k, count in enumerate(counts) for i in range(count)]
         limit = self.scaling.feature_limit
         super().__init__(
-            sum(counts),
+            [part.env for part in parts],
+            [view for part in parts for view in part.views],
             spaces.Box(-limit, limit, (self.scaling.features,), dtype=np.float32),
             spaces.Box(-1.0, 1.0, (2,), dtype=np.float32),
+            monitored=True,
         )
         self.seconds = 0.0
-        """Time spent in here so far, s."""
+        """Time spent in this class so far, s."""
 
     @property
     def solves(self) -> int:
-        """Solves of the NMPC so far, where actions are additions to its."""
+        """Number of solves so far of the NMPC whose actions are corrected."""
         return sum(part.solves for part in self._parts)
 
     @property
-    def shown(self) -> NDArray[np.float64]:
-        """What agents are shown now, in SI units, (n, size)."""
-        return np.concatenate([part.seen for part in self._parts])
+    def agent_observations(self) -> NDArray[np.float64]:
+        """Observations that agents would be given now, SI units, (n, size)."""
+        return np.concatenate([part.observations for part in self._parts])
 
     @property
     def origins(self) -> NDArray[np.float64]:
-        """What actions are additions to now, (n, 2)."""
-        return np.concatenate([part.origin for part in self._parts])
+        """Origins of the next actions, (n, 2) [m/s^2, rad]."""
+        return np.concatenate([part.origins for part in self._parts])
 
     def policy_of(
         self, model: Any, algorithm: str, training: Mapping[str, Any] | None = None
     ) -> Policy:
-        """Take the policy out of a model of SB3 that has learned on this, ready to be written.
+        """Extract the policy from an SB3 model that has learned on these environments.
 
         Parameters
         ----------
         model
             PPO, SAC or TD3 with "MlpPolicy".
         algorithm
-            What it is called.
+            Name of the algorithm, stored with the policy.
         training
-            Where it comes from, in plain JSON.
+            Origin of the policy, in plain JSON.
 
         Raises
         ------
@@ -212,7 +317,7 @@ class LearnerVecEnv(VecEnv):
         self.seconds += time.perf_counter() - began
 
     def step_wait(self) -> tuple[Array, Array, Array, Infos]:
-        """Drive a control period: features, rewards, dones, infos as `TrackingVecEnv` has them."""
+        """Drive a control period; return features, rewards, dones, and `TrackingVecEnv`'s infos."""
         began = time.perf_counter()
         features, rewards, dones = [], [], []
         infos: Infos = []
@@ -221,47 +326,10 @@ class LearnerVecEnv(VecEnv):
             for row in np.flatnonzero(done).tolist():
                 last = info[row]["terminal_observation"]
                 info[row]["terminal_observation"] = part.last_features(last, row)
-            part.look(observations, done)
+            part.observe(observations, done)
             features.append(part.features())
             rewards.append(reward)
             dones.append(done)
             infos += info
         self.seconds += time.perf_counter() - began
         return np.concatenate(features), np.concatenate(rewards), np.concatenate(dones), infos
-
-    def close(self) -> None:
-        """Close the vector environments."""
-        for part in self._parts:
-            part.venv.close()
-
-    def _each(self, indices: Any) -> list[tuple[TrackingVecEnv, int]]:
-        places = (self._where[i] for i in self._get_indices(indices))
-        return [(self._parts[k].venv, i) for k, i in places]
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Attribute of each environment, see `agents.sb3.EnvironmentView`."""
-        return [venv.get_attr(attr_name, i)[0] for venv, i in self._each(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse, as the vector environments do."""
-        for venv, i in self._each(indices):
-            venv.set_attr(attr_name, value, i)
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """Call a method of each environment."""
-        return [
-            venv.env_method(method_name, *method_args, indices=i, **method_kwargs)[0]
-            for venv, i in self._each(indices)
-        ]
-
-    def env_is_wrapped(
-        self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None
-    ) -> list[bool]:
-        """Whether each does what a wrapper does."""
-        return [venv.env_is_wrapped(wrapper_class, i)[0] for venv, i in self._each(indices)]
-
-    def get_images(self) -> Sequence[Array | None]:
-        """Frames of all environments, where they have a render mode."""
-        return [frame for part in self._parts for frame in part.venv.get_images()]

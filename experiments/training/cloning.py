@@ -86,7 +86,7 @@ class CloningTrainer(Trainer):
         asked: list[Array] = [self._asked]
         said: list[Array] = [self._said]
         for _ in range(self.hyper["round"]):
-            actions, memory = self._expert.predict(self.env.shown, memory, starts)
+            actions, memory = self._expert.predict(self.env.agent_observations, memory, starts)
             scaling = self.env.scaling
             wanted = (actions - self.env.origins - scaling.centre) / scaling.half
             wanted = np.clip(wanted, -1.0, 1.0).astype(np.float32)

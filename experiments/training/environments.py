@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import agents
 import trajectories
-from agents.learned.learner import LearnerVecEnv
-from agents.learned.scaling import usual_scaling
+from agents.learned.learner import LearnerVecEnv, usual_scaling
 from experiments.training.seeds import path_names
 from experiments.training.settings import TrainingSettings
 from lpv_track_env import vehicle

@@ -2,19 +2,15 @@
 
 import dataclasses
 import functools
-import hashlib
 import itertools
-import json
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
-from agents.learned import Policy, read, write
+from agents.learned import Policy, write
 from agents.learned.network import Network
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.vehicle import VEHICLES
@@ -103,37 +99,6 @@ def act(policy: Policy, rows: NDArray[Any], base: NDArray[Any], bound: float = 1
 def observations(n: int, seed: int = 0) -> NDArray[np.float64]:
     rows = np.random.default_rng(seed).normal(size=(n, 48)) * 3.0
     return rows.astype(np.float32).astype(np.float64)
-
-
-# Files with something else in them.
-
-
-def refusal(file: Path) -> str:
-    """What reading says: one line that names a file."""
-    with pytest.raises(ValueError, match=file.stem) as raised:
-        read(file)
-    said = str(raised.value)
-    assert "\n" not in said
-    assert file.stem in said
-    return said
-
-
-def change(file: Path, edit: Callable[[dict[str, Any]], Any], *, digest: bool = True) -> None:
-    """Edit a spec, with the digest that then belongs to it."""
-    spec = json.loads(file.read_text())
-    edit(spec)
-    if digest:
-        spec.pop("digest", None)
-        canonical = json.dumps(spec, sort_keys=True, separators=(",", ":"))
-        spec["digest"] = hashlib.sha256(canonical.encode()).hexdigest()
-    file.write_text(json.dumps(spec))
-
-
-def put_weights(file: Path, content: bytes) -> None:
-    """Other weights, with the digests that then belong to them."""
-    file.with_suffix(".safetensors").write_bytes(content)
-    sha = hashlib.sha256(content).hexdigest()
-    change(file, lambda spec: spec["weights"].update(sha256=sha, bytes=len(content)))
 
 
 # Policies that drive `m2-minibus`: feedback written down as a network.

@@ -2,16 +2,13 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from agents.weight_tuning.choice import DIRECTIONS, WeightChoice
 from agents.weight_tuning.features import size
-from agents.weight_tuning.policy import WeightPolicy, read, write
+from agents.weight_tuning.policy import WeightPolicy
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import ObservationLayout
 from trajectories import CurvatureBands
@@ -66,12 +63,6 @@ def random_weight_policy(
     return WeightPolicy(**{**fields, **changes})
 
 
-def written(folder: Path, policy: WeightPolicy, name: str = "mine.json") -> Path:
-    """The file, after writing it."""
-    write(policy, folder / name)
-    return folder / name
-
-
 def same(one: WeightPolicy, other: WeightPolicy) -> bool:
     """Whether every field is the same, arrays to the bit."""
     arrays, others = ([a for layer in p.layers for a in layer] for p in (one, other))
@@ -85,18 +76,3 @@ def same(one: WeightPolicy, other: WeightPolicy) -> bool:
         )
         and one.choice == other.choice
     )
-
-
-def refusal(file: Path, by: Callable[[Path], object] = read) -> str:
-    """What reading says: one line that names the file."""
-    with pytest.raises(ValueError, match=file.stem) as raised:
-        by(file)
-    return checked(file, raised.value)
-
-
-def checked(file: Path, error: ValueError) -> str:
-    """What an error says, which must be one line that names the file."""
-    said = str(error)
-    assert len(said.splitlines()) == 1
-    assert file.stem in said
-    return said

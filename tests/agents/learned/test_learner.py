@@ -12,9 +12,8 @@ import agents
 import lpv_track_env  # noqa: F401  registers the environments
 from agents.base import DrivingTask
 from agents.learned.agent import LearnedPolicy
-from agents.learned.learner import LearnerVecEnv
+from agents.learned.learner import LIMIT, LearnerVecEnv, Scaling, usual_scaling
 from agents.learned.policy import ORIGINS, Policy
-from agents.learned.scaling import LIMIT, Scaling, usual_scaling
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.registration import PATH_TRACKING
 from lpv_track_env.vector_env import PathTrackingVectorEnv
@@ -162,7 +161,7 @@ def test_the_usual_scaling_says_what_its_docstring_does(
     values[0, layout.slices["reference_speed"]] = 8.0
     values[0, layout.slices["preview_speed"]] = 6.5
     values[0, layout.slices["lateral_error"]] = 0.1
-    x = scaling.of(values)[0]
+    x = scaling.features_of(values)[0]
     speeds = x[10 + k : 10 + 2 * k]
     np.testing.assert_allclose(speeds, -1.5, rtol=1e-6)
     assert x[9] == pytest.approx(1.0)
@@ -172,7 +171,7 @@ def test_the_usual_scaling_says_what_its_docstring_does(
     if origin == "actuators":
         np.testing.assert_allclose(scaling.half, rates)
     values[:] = 1e6
-    assert np.abs(scaling.of(values)).max() == LIMIT
+    assert np.abs(scaling.features_of(values)).max() == LIMIT
 
 
 def test_actions_stay_within_the_action_space() -> None:

@@ -2,60 +2,85 @@
 
 import base64
 import json
-import os
 import pickle
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import pytest
 
 import agents
 from experiments.cli import main
-from tests.helpers.learned_policies import put_weights, refusal, written
+from tests.helpers.policy_files import (
+    DRIVING,
+    Payload,
+    PolicyKind,
+    each_kind,
+    put_weights,
+    refusal,
+)
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
-    return written(tmp_path)
+def file(kind: PolicyKind, tmp_path: Path) -> Path:
+    return kind.written(tmp_path)
 
 
-class Payload:
-    """What a pickle runs when it is loaded: here it makes a folder."""
-
-    def __init__(self, marker: Path) -> None:
-        self.marker = str(marker)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return os.mkdir, (self.marker,)
-
-
-def test_a_pickle_in_place_of_the_weights_is_not_run(file: Path, tmp_path: Path) -> None:
+@each_kind
+def test_a_pickle_in_place_of_the_weights_is_not_run(
+    kind: PolicyKind, file: Path, tmp_path: Path
+) -> None:
     torch = pytest.importorskip("torch")
     marker = tmp_path / "was-run"
-    torch.save({"features.weight": Payload(marker)}, tmp_path / "weights.pt")
-    content = (tmp_path / "weights.pt").read_bytes()
-    put_weights(file, content)
-    assert "is not safetensors" in refusal(file)
-    put_weights(file, pickle.dumps(Payload(marker)))
-    assert "is not safetensors" in refusal(file)
+    torch.save({"layers.0.weight": Payload(marker)}, tmp_path / "weights.pt")
+    for content in ((tmp_path / "weights.pt").read_bytes(), pickle.dumps(Payload(marker))):
+        put_weights(file, content)
+        for by in kind.readers:
+            assert "is not safetensors" in refusal(file, by)
     assert not marker.exists()
     # The payload is real.
     torch.load(tmp_path / "weights.pt", weights_only=False)
     assert marker.is_dir()
 
 
-def test_a_pickle_in_place_of_the_spec_is_not_run(file: Path, tmp_path: Path) -> None:
+@each_kind
+def test_a_pickle_in_place_of_the_spec_is_not_run(
+    kind: PolicyKind, file: Path, tmp_path: Path
+) -> None:
     marker = tmp_path / "was-run"
     for protocol in (0, 4):
         file.write_bytes(pickle.dumps(Payload(marker), protocol=protocol))
-        refusal(file)
+        for by in kind.readers:
+            refusal(file, by)
     assert not marker.exists()
     pickle.loads(file.read_bytes())  # noqa: S301
     assert marker.is_dir()
+
+
+@each_kind
+def test_reading_unpickles_nothing_and_loads_no_torch(kind: PolicyKind, file: Path) -> None:
+    for by in kind.readers:
+        code = (
+            "import sys\n"
+            f"from {by.__module__} import {by.__name__}\n"
+            "found = []\n"
+            "hook = lambda event, _: found.append(event) if 'pickle' in event else None\n"
+            "sys.addaudithook(hook)\n"
+            f"{by.__name__}({str(file)!r})\n"
+            "print(found, sorted({'torch', 'stable_baselines3', 'casadi'} & set(sys.modules)))\n"
+        )
+        assert printed(code) == ["[]", "[]"]
+
+
+def printed(code: str) -> list[str]:
+    """Words that a fresh interpreter prints."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
 
 
 @pytest.fixture(scope="module")
@@ -85,13 +110,13 @@ def test_a_model_of_sb3_is_not_loaded_without_trust(
     assert said.count("\n") == 1
     assert "runs code" in said
     assert "--trust" in said
-    assert "import-policy" in refusal(model)
+    assert "import-policy" in refusal(model, DRIVING.read)
     with pytest.raises(ValueError, match="import-policy"):
         agents.make(str(model), gymnasium.make("lpv_track_env/PathTracking-v0"))
     (tmp_path / "model.json").write_bytes(model.read_bytes())
-    refusal(tmp_path / "model.json")
-    put_weights(file := written(tmp_path), model.read_bytes())
-    refusal(file)
+    refusal(tmp_path / "model.json", DRIVING.read)
+    put_weights(file := DRIVING.written(tmp_path), model.read_bytes())
+    refusal(file, DRIVING.read)
     assert not marker.exists()
     # The payload is real: SB3's own way of loading runs it.
     import stable_baselines3
@@ -116,20 +141,11 @@ def test_without_trust_a_model_is_not_even_looked_at(
     assert "there is no file" in capsys.readouterr().err
 
 
-def test_reading_and_driving_load_no_torch_and_unpickle_nothing(file: Path) -> None:
+def test_driving_loads_no_torch(tmp_path: Path) -> None:
     code = (
-        "import sys\n"
-        "from agents.learned import read\n"
-        "found = []\n"
-        "sys.addaudithook(lambda event, _: found.append(event) if 'pickle' in event else None)\n"
-        f"read({str(file)!r})\n"
-        "print(found)\n"
-        "import gymnasium, agents, lpv_track_env\n"
+        "import sys, gymnasium, agents, lpv_track_env\n"
         "env = gymnasium.make('lpv_track_env/PathTracking-v0', trajectory='straight')\n"
-        f"agents.make({str(file)!r}, env).predict(env.reset()[0])\n"
+        f"agents.make({str(DRIVING.written(tmp_path))!r}, env).predict(env.reset()[0])\n"
         "print(sorted({'torch', 'stable_baselines3', 'casadi'} & set(sys.modules)))\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.stdout.split() == ["[]", "[]"], done.stderr
+    assert printed(code) == ["[]"]

@@ -59,7 +59,7 @@ SI = gymnasium.spaces.Box(np.float32([-5.0, -0.5]), np.float32([3.5, 0.5]), dtyp
 def test_a_policy_is_its_sb3_model(
     algorithm: str, activation: str, actions: gymnasium.spaces.Box
 ) -> None:
-    from agents.learned.sb3 import from_sb3
+    from agents.learned.sb3_policies import from_sb3
 
     rng = np.random.default_rng(0)
     weight, bias = rng.normal(size=(9, 48)) / 5.0, rng.normal(size=9)
@@ -86,7 +86,7 @@ def test_what_sb3_has_besides_is_refused() -> None:
     stable_baselines3 = pytest.importorskip("stable_baselines3")
     import torch
 
-    from agents.learned.sb3 import from_sb3
+    from agents.learned.sb3_policies import from_sb3
 
     def refused(model: Any) -> str:
         with pytest.raises(ValueError, match="cannot be taken") as raised:

@@ -81,7 +81,7 @@ def test_seeds_and_options_hold_for_one_reset() -> None:
 def test_other_modes_and_factors_are_refused() -> None:
     with pytest.raises(ValueError, match="autoreset_mode='SameStep'"):
         learner(2, autoreset_mode="NextStep")
-    with pytest.raises(ValueError, match=r"seen must have shape \(48,\), not \(3,\)"):
+    with pytest.raises(ValueError, match=r"feature_mask must have shape \(48,\), not \(3,\)"):
         learner(2, np.ones(3))
 
 
@@ -141,7 +141,7 @@ def test_a_policy_is_blind_to_what_is_hidden() -> None:
     policy = env.policy_of(actor_of(model), "ppo", {"seed": 0})
     x = np.random.default_rng(0).normal(size=(50, 48)).astype(np.float32)
     with torch.no_grad():
-        wanted = model.policy.get_distribution(torch.as_tensor(x * env.seen)).mode().numpy()
+        wanted = model.policy.get_distribution(torch.as_tensor(x * env.feature_mask)).mode().numpy()
     for noise in (0.0, 100.0):
         np.testing.assert_allclose(forward(policy.layers)(x + noise * hidden), wanted, atol=1e-6)
     assert not policy.layers[0][0][:, hidden].any()

@@ -19,7 +19,8 @@ from experiments.run.suites import (
 )
 from experiments.training.seeds import TRAINING_PATHS, VALIDATION_PATHS
 from lpv_track_env.observation import ObservationLayout
-from tests.helpers.learned_policies import random_policy, written
+from tests.helpers.learned_policies import random_policy
+from tests.helpers.policy_files import DRIVING
 
 
 @pytest.mark.parametrize("suite", SUITES)
@@ -98,7 +99,7 @@ def test_learned_policies_are_compared_on_paths_that_nobody_trained_on() -> None
 def test_a_policy_file_drives_raw_waypoints_if_it_was_made_for_their_preview(
     steps: int, period: float, raw: int, tmp_path: Path
 ) -> None:
-    file = written(tmp_path, random_policy(layout=ObservationLayout(steps, period)))
+    file = DRIVING.written(tmp_path, random_policy(layout=ObservationLayout(steps, period)))
     specs = SUITES["paper"]([str(file), "stanley"], [0])
     drives = Counter(spec["agent"] for spec in specs if spec["trajectory"] in RAW)
     assert drives == Counter({str(file): raw, "stanley": 6})
