@@ -8,7 +8,6 @@ import numpy as np
 import trajectories
 from experiments.run.case import run_case
 from trajectories import SpeedLimits, shapes
-from trajectories.catalog import from_geometry
 from trajectories.files import write
 
 LIMITS = SpeedLimits(max_speed=8.0, max_lateral_acceleration=1.5, max_acceleration=1.0)
@@ -17,7 +16,7 @@ LIMITS = SpeedLimits(max_speed=8.0, max_lateral_acceleration=1.5, max_accelerati
 def from_segments() -> trajectories.ReferencePath:
     """Straights in metres, turns in degrees with their radius: the language of T1 to T6."""
     segments = shapes.fit(shapes.parse("S 40 | L 90 r15 | S 30 | R 60 r20 | S 40"), LIMITS)
-    return from_geometry(shapes.build(segments), LIMITS, "segments")
+    return shapes.from_geometry(shapes.build(segments), LIMITS, "segments")
 
 
 def from_waypoints(file: Path) -> trajectories.ReferencePath:

@@ -35,6 +35,9 @@ _SUBMODULES = (
     "vehicle",
 )
 
+COMPILED_LIBRARY = True
+"""Compiled functions of other packages may use this one: see `trajectories.compilation`."""
+
 register()
 
 

@@ -15,7 +15,7 @@ from lpv_track_env import kernels
 from lpv_track_env.bicycle import PSI, VX, X, Y
 from lpv_track_env.draws import uniform
 from trajectories.compilation import compiled, compiled_internal
-from trajectories.interpolation import heading_at, position_at, speed_at
+from trajectories.table import heading_at, position_at, speed_at
 
 Array = NDArray[Any]
 

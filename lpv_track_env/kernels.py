@@ -17,9 +17,8 @@ from lpv_track_env.integration import integrate
 from lpv_track_env.observation import PREVIEW_BOUNDS, PREVIEW_START, SCALARS
 from lpv_track_env.reward import terms
 from trajectories.compilation import compiled, compiled_in_place, compiled_inline, compiled_internal
-from trajectories.interpolation import cell, saturate, speed_in
-from trajectories.preview import fill_preview
 from trajectories.projection import SEARCH_WINDOW, follow
+from trajectories.table import cell, fill_preview, saturate, speed_in
 
 Array = NDArray[Any]
 

@@ -1,4 +1,4 @@
-"""Named trajectories: the paper's six (drivable and raw), analytic shapes, random paths, files."""
+"""Trajectories by name: the paper's six (drivable and raw), analytic shapes, random paths."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from trajectories import shapes
+from trajectories import files, shapes
 from trajectories.curvature import PathStatistics, signed_waypoint_curvature
 from trajectories.naming import suggestion
 from trajectories.path import SPACING, ReferencePath
@@ -22,7 +22,7 @@ GENERATOR = "segments/1"
 
 @dataclass(frozen=True)
 class Published:
-    """A trajectory's specification: its published rows (SI units) and our segments for them."""
+    """A trajectory of the paper: its published statistics, and this project's segments for them."""
 
     rows: PathStatistics
     segments: str
@@ -80,7 +80,7 @@ PUBLISHED: dict[str, Published] = {
         "S 380 | L 110 r27 | S 420 | L 60 r120 | S 250 | R 70 r26 | S 420 | L 46.5 r30 | S 250",
     ),
 }  # fmt: skip
-"""The paper's six trajectories; the segments are this project's, the paths were not published."""
+"""The paper's six trajectories; it published no paths, so the segments are this project's."""
 
 ANALYTIC = ("straight", "circle", "figure-eight", "double-lane-change", "sine", "u-turn")
 SHAPE_LIMITS = SpeedLimits(
@@ -89,14 +89,16 @@ SHAPE_LIMITS = SpeedLimits(
 
 
 def names() -> list[str]:
-    """Names that `load` knows, each of which loads; so do random-SEED and random-fast-SEED >= 0."""
+    """Names that `load` knows; it also loads random-SEED and random-fast-SEED for any SEED >= 0."""
     return [
         *PUBLISHED, *(f"{name}-raw" for name in PUBLISHED), *ANALYTIC, "random-0", "random-fast-0",
     ]  # fmt: skip
 
 
 def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
-    """Resolve a name, a file (native CSV, racetrack CSV, x,y CSV, GPS log) or a path itself.
+    """Load a path by its name or from a file (native, racetrack or x,y CSV, GPS log).
+
+    A `ReferencePath` is returned as it is.
 
     Raises
     ------
@@ -116,9 +118,7 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
     if kind in {"random", "random-fast"} and seed.isdecimal():
         return _random(int(seed), kind == "random-fast")
     if name.endswith(".csv") or Path(name).is_file():
-        from trajectories.files import read
-
-        return read(Path(name))
+        return files.read(Path(name))
     known = suggestion(name, names(), " and both with any other seed")
     raise ValueError(f"unknown trajectory {name!r}; {known}, or give a .csv file")
 
@@ -128,8 +128,8 @@ def _random(seed: int, fast: bool) -> ReferencePath:
     return random_path(seed, fast=fast)
 
 
-def limits_of(rows: PathStatistics) -> SpeedLimits:
-    """Speed limits that make a profile reach published rows."""
+def _limits(rows: PathStatistics) -> SpeedLimits:
+    """Speed limits whose profile reaches the published statistics."""
     return SpeedLimits(
         max_speed=rows.max_speed,
         max_lateral_acceleration=rows.max_lateral_acceleration,
@@ -137,34 +137,17 @@ def limits_of(rows: PathStatistics) -> SpeedLimits:
     )
 
 
-def from_geometry(
-    geometry: shapes.Geometry,
-    limits: SpeedLimits,
-    name: str,
-    *,
-    closed: bool = False,
-    **metadata: object,
-) -> ReferencePath:
-    """Add the jerk-limited speed profile that some limits allow to a geometry."""
-    spacing = float(geometry.arc_length[1])
-    speed = plan_speed(geometry.curvature, spacing, limits, closed=closed, share=geometry.share)
-    return ReferencePath(
-        *geometry[:5], speed=speed, name=name, closed=closed,
-        metadata={"limits": asdict(limits), **metadata},
-    )  # fmt: skip
-
-
 @cache
 def _drivable(name: str) -> ReferencePath:
     published = PUBLISHED[name]
-    limits = limits_of(published.rows)
+    limits = _limits(published.rows)
     segments = shapes.fit(
         shapes.parse(published.segments),
         limits,
         length=published.rows.length,
         total_turning=SPACING * published.rows.total_curvature,
     )
-    return from_geometry(
+    return shapes.from_geometry(
         shapes.build(segments), limits, name,
         source="kumar2025lpv: published rows; segments by lpv-track-env",
         generator=GENERATOR, segments=published.segments, published=asdict(published.rows),
@@ -172,7 +155,7 @@ def _drivable(name: str) -> ReferencePath:
 
 
 def _kink_curvature(angle: float, spacing: float) -> tuple[float, float]:
-    """Curvature at a kink, and summed over it and its neighbours, by `waypoint_curvature`."""
+    """Curvature at a kink by `signed_waypoint_curvature`, and summed with both neighbours, 1/m."""
     half = 0.5 * angle
     top = math.sin(half) / (spacing * math.cos(half) ** 2)
     return top, top + math.sin(angle) / (2.0 * spacing)
@@ -180,11 +163,11 @@ def _kink_curvature(angle: float, spacing: float) -> tuple[float, float]:
 
 @cache
 def _raw(name: str) -> ReferencePath:
-    """Kinked waypoints whose discrete curvature matches both published curvature rows.
+    """Make kinked waypoints whose discrete curvature has both published maximum and total.
 
-    The drivable path's turns become kinks in their middle, none sharper than the angle whose
-    curvature is the published maximum; the first of the sharpest turn has just that angle, and all
-    others share one factor that makes the sum of |kappa_i| the published total.
+    Turns of the drivable path become kinks in their middle, none sharper than the angle whose
+    curvature is the published maximum. The first kink of the sharpest turn has exactly that angle;
+    all others are scaled by one factor that makes the sum of |kappa_i| the published total.
     """
     from scipy.optimize import brentq
 
@@ -221,15 +204,15 @@ def _raw(name: str) -> ReferencePath:
 
 
 def _kinked(x: Array, y: Array, spacing: float, name: str) -> ReferencePath:
-    """Make a raw path: heading and curvature by central differences, a speed that is drivable."""
+    """Make a raw path: heading and curvature by central differences, and a drivable speed."""
     rows = PUBLISHED[name].rows
     dx, dy = np.gradient(x), np.gradient(y)
     heading = np.unwrap(np.arctan2(dy, dx))
-    # A kink spread over 12 m by a Hann window: what a vehicle's own turning makes of it.
+    # A vehicle smooths a kink by its own turning: spread it over 12 m by a Hann window.
     window = np.hanning(2 * round(6.0 / spacing) + 1)
     turning = np.gradient(heading, spacing)
     effective = np.convolve(turning, window / window.sum(), mode="same")
-    limits = limits_of(rows)
+    limits = _limits(rows)
     return ReferencePath(
         arc_length=np.linspace(0.0, rows.length, len(x)),
         x=x, y=y, heading=heading, curvature=signed_waypoint_curvature(x, y),
@@ -264,7 +247,9 @@ def _analytic(name: str) -> ReferencePath:
         geometry = shapes.parametric(_sine, 160.0)
     else:
         geometry = shapes.parametric(_double_lane_change, 165.0)
-    return from_geometry(geometry, SHAPE_LIMITS, name, closed=closed, source=f"analytic: {name}")
+    return shapes.from_geometry(
+        geometry, SHAPE_LIMITS, name, closed=closed, source=f"analytic: {name}"
+    )
 
 
 def _circle(t: Array) -> shapes.Derivatives:
@@ -276,7 +261,7 @@ def _circle(t: Array) -> shapes.Derivatives:
 def _figure_eight(t: Array) -> shapes.Derivatives:
     """Gerono's lemniscate, 88 m by 44 m, crossing itself at the origin.
 
-    Its sharpest 0.109 1/m is within the 0.115 1/m that a wheelbase of 5 m can steer.
+    Its largest curvature, 0.109 1/m, is within the 0.115 1/m that a wheelbase of 5 m can steer.
     """
     a = 44.0
     x, y = a * np.sin(t), 0.5 * a * np.sin(2.0 * t)
@@ -284,7 +269,7 @@ def _figure_eight(t: Array) -> shapes.Derivatives:
 
 
 def _sine(t: Array) -> shapes.Derivatives:
-    """Amplitude 2 m, period 40 m over 160 m."""
+    """Sine with an amplitude of 2 m and a period of 40 m, 160 m long."""
     amplitude, k = 2.0, 2.0 * math.pi / 40.0
     sine, cosine = np.sin(k * t), np.cos(k * t)
     return (
@@ -294,10 +279,10 @@ def _sine(t: Array) -> shapes.Derivatives:
 
 
 def _double_lane_change(t: Array) -> shapes.Derivatives:
-    """Centre line of ISO 3888-1's course: 15 m, 30 m across, 25 m, 25 m back, then straight.
+    """Centre line of the ISO 3888-1 course: 15 m, 30 m across, 25 m, 25 m back, then straight.
 
-    The offset of 3.5 m is the lanes' width in the standard; the ramps are quintic (smoothstep of
-    second order), so curvature is continuous. 20 m of run-up and a straight exit are added.
+    The offset of 3.5 m is the standard's lane width; the ramps are quintic (smoothstep of second
+    order), so curvature is continuous. A run-up of 20 m and a straight exit are added.
     """
     offset, up, down = 3.5, (35.0, 65.0), (90.0, 115.0)
     y, dy, ddy = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
@@ -313,11 +298,11 @@ def _double_lane_change(t: Array) -> shapes.Derivatives:
 def random_path(
     seed: int | np.random.Generator, *, length: float | None = None, fast: bool = False
 ) -> ReferencePath:
-    """Draw a drivable path: turns of 9 to 60 m radius between straights, for training.
+    """Draw a drivable path for training: turns of 9 to 60 m radius between straights.
 
     The same seed gives the same path. Speed limits are drawn too: 6 to 14 m/s (`fast`: 10 to 18),
     1.0 to 2.0 m/s^2 laterally, 1.3 to 2.0 m/s^2 longitudinally. Straights are 8 to 120 m long
-    (`fast`: 40 to 400), `length` (m) is drawn from 300 to 600 (`fast`: 600 to 1000) unless given.
+    (`fast`: 40 to 400). Unless given, `length` (m) is drawn from 300 to 600 (`fast`: 600 to 1000).
     """
     alone = isinstance(seed, np.random.Generator)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
@@ -342,7 +327,7 @@ def random_path(
         straight = shapes.Segment(length=float(np.exp(rng.uniform(*np.log(straights)))))
         segments += [turn, straight]
         planned = sum(part.length for part in shapes.fit(segments, limits))
-    return from_geometry(
+    return shapes.from_geometry(
         shapes.build(shapes.fit(segments, limits)), limits, kind if alone else f"{kind}-{seed}",
         source=f"{kind} segments" if alone else f"{kind} segments, seed {seed}",
         generator=GENERATOR,

@@ -1,5 +1,6 @@
-"""Compile numerical functions with numba, cached on disk, never stale."""
+"""Compile numerical functions with numba, cached on disk and never stale."""
 
+import gc
 import hashlib
 import sys
 import warnings
@@ -11,18 +12,127 @@ from typing import Any, TypeVar
 import numba
 from numba.core import event, types
 from numba.core.registry import CPUDispatcher
-
-from trajectories.compile_time import Arithmetic, Collector
+from numba.core.types.functions import BaseFunction
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+HERE = Path(__file__).parent
+NUMBERS = (types.Float, types.Integer, types.Boolean)
+"""Numba's types of numbers that carry no literal value."""
+
+_compiled_here: set[Callable[..., Any]] = set()
+
+
+def compiled(function: Function) -> Function:
+    """`numba.njit` with IEEE arithmetic, an on-disk cache, and division by zero giving inf.
+
+    Where no cache folder is writable, warn once and compile anew in every process.
+    """
+    return _compile(function)
+
+
+def compiled_in_place(function: Function) -> Function:
+    """`compiled`, inlined into its callers by numba.
+
+    For large functions with few callers: LLVM optimises each level of calls between large functions
+    all over again, which takes seconds. Not for functions called from parallel loops.
+    """
+    return _compile(function, inline="always")
+
+
+def compiled_internal(function: Function) -> Function:
+    """`compiled` without wrappers, for functions called from compiled code: half the time.
+
+    Unboxing a few arrays takes longer to compile than a short function that works on them. Python
+    can call the function too, but compiles an entry point in each process: good enough for tests.
+    """
+    return _compile_internal(function)
+
+
+def compiled_inline(function: Function) -> Function:
+    """`compiled_internal`, always inlined by LLVM: for the body of a loop to be vectorised."""
+    return _compile_internal(function, forceinline=True)
+
+
+def compiled_parallel(function: Function) -> Function:
+    """`compiled`, with `numba.prange` loops run in threads, each calling one ordinary function.
+
+    (A body that numba inlines into such a loop was seen to give wrong results.)
+    """
+    return _compile(function, parallel=True, _nrt=True)
+
+
+def compiled_with_lists(*folders: Path) -> Callable[[Function], Function]:
+    """`compiled`, for functions that allocate lists or arrays, as other packages' models do.
+
+    `folders` hold further sources that the function calls: a change there makes its cache stale.
+    """
+    return lambda function: _compile(function, *folders, _nrt=True)
+
+
+def entry_point(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+    """Return the machine code of a compiled function for these types of arguments.
+
+    A call of the function itself looks up the types of all arguments, which takes as long as to
+    pass them: 0.2 us for a handful of arrays. A call of the returned function does not, so it must
+    be given arguments of the very same types: an array of another layout would be misread.
+    """
+    if not isinstance(function, numba.core.dispatcher.Dispatcher):
+        return function  # With NUMBA_DISABLE_JIT=1 it is plain Python.
+    entry: Callable[..., Any] = function.compile(tuple(map(numba.typeof, arguments)))
+    return entry
+
+
+def _compile(function: Function, *sources: Path, **more: bool | str) -> Function:
+    # Without numba's runtime there are no references to count, which saves a tenth of the time to
+    # compile. No memory can be allocated then, but views of arrays work.
+    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False, "_nrt": False, **more}
+    _compiled_here.add(function)
+    try:
+        dispatcher = numba.njit(cache=True, **options)(function)
+    except RuntimeError:
+        _warn_of_no_cache()
+        return numba.njit(**options)(function)  # type: ignore[no-any-return]
+    index = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if index is not None and hasattr(index, "_source_stamp"):
+        folders = dict.fromkeys((*_packages_below(function), *sources))
+        index._source_stamp = (index._source_stamp, source_digest(*folders))  # noqa: SLF001
+    return dispatcher  # type: ignore[no-any-return]
+
+
+def _compile_internal(function: Function, **more: bool) -> Function:
+    dispatcher: Any = _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True, **more)
+    if isinstance(dispatcher, CPUDispatcher):
+        dispatcher.__class__ = _Internal
+    return dispatcher  # type: ignore[no-any-return]
+
+
+class _Internal(CPUDispatcher):
+    """A compiled function without wrappers; the first call from Python compiles an entry point."""
+
+    def __call__(self, *arguments: Any) -> Any:
+        if not hasattr(self, "_entry"):
+            internal = self
+            self._entry = numba.njit(lambda *given: internal(*given))  # noqa: PLW0108
+        return self._entry(*arguments)
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        # Otherwise numba compiles one version for each integer that callers write out.
+        plain = {name: _without_literal(kind) for name, kind in kws.items()}
+        return super().get_call_template([_without_literal(kind) for kind in args], plain)
+
+
+def _without_literal(kind: Any) -> Any:
+    """Return the type of a literal integer's value in place of the literal's own type."""
+    return kind.literal_type if isinstance(kind, types.IntegerLiteral) else kind
 
 
 @cache
 def source_digest(*folders: Path) -> str:
     """Digest of all Python sources in some folders.
 
-    numba notices a change in the file of a cached function, not in what that function calls or in
-    a constant it imports: this digest closes the gap.
+    numba notices a change in the file of a cached function, but not in the functions that it calls
+    or in the constants that it imports: this digest closes the gap.
     """
     digest = hashlib.sha256()
     for folder in folders:
@@ -30,6 +140,22 @@ def source_digest(*folders: Path) -> str:
             name = file.relative_to(folder.parent).as_posix()
             digest.update(name.encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
+
+
+def _packages_below(function: Callable[..., Any]) -> list[Path]:
+    """Folders of the packages whose sources a compiled function may use, its own among them.
+
+    These are this package, every loaded package that has `COMPILED_LIBRARY = True` (compiled
+    functions and constants for packages above it), and the function's own.
+    """
+    own = Path(function.__code__.co_filename).parent
+    while (own.parent / "__init__.py").is_file():
+        own = own.parent
+    if own == HERE:
+        return [HERE]
+    packages = [module for name, module in sys.modules.items() if "." not in name]
+    libraries = [one for one in packages if getattr(one, "__dict__", {}).get("COMPILED_LIBRARY")]
+    return [HERE, *sorted(Path(str(one.__file__)).parent for one in libraries), own]
 
 
 @cache
@@ -42,28 +168,18 @@ def _warn_of_no_cache() -> None:
     )
 
 
-def _package(folder: Path) -> Path:
-    """Topmost package that a folder is in, or the folder itself."""
-    while (folder.parent / "__init__.py").is_file():
-        folder = folder.parent
-    return folder
-
-
 class _Announcement(event.Listener):
-    """Says once in a process that something is being compiled: no silent wait."""
+    """Say once in a process that something is being compiled: no silent wait."""
 
     def __init__(self) -> None:
         self.said = False
 
     def on_start(self, event: event.Event) -> None:
         function = getattr(event.data.get("dispatcher"), "py_func", None)
-        if (
-            self.said
-            or (getattr(function, "__module__", "") or "").partition(".")[0] not in PACKAGES
-        ):
+        if self.said or function not in _compiled_here:
             return
         self.said = True
-        # In one piece: processes that compile side by side share the terminal.
+        # One write: processes that compile side by side share the terminal.
         sys.stderr.write(
             "lpv-track-env: compiling numerical code (some seconds, once; then kept on disk) ...\n"
         )
@@ -73,111 +189,78 @@ class _Announcement(event.Listener):
         pass
 
 
-PACKAGES = ("trajectories", "lpv_track_env", "agents", "experiments")
-for _listener in (_Announcement(), Collector(), Arithmetic()):
+class _Accelerator(event.Listener):
+    """Change something while numba compiles, from the outermost function's start to its end."""
+
+    def __init__(self) -> None:
+        self.depth = 0
+
+    def begin(self) -> None:
+        """Make the change."""
+
+    def end(self) -> None:
+        """Undo the change."""
+
+    def on_start(self, event: event.Event) -> None:  # noqa: ARG002  part of the protocol
+        self.depth += 1
+        if self.depth == 1:
+            self.begin()
+
+    def on_end(self, event: event.Event) -> None:  # noqa: ARG002  part of the protocol
+        self.depth -= 1
+        if self.depth == 0:
+            self.end()
+
+
+class _NoGarbageCollection(_Accelerator):
+    """Keep the garbage collector off, which saves a tenth of the time to compile.
+
+    The objects that numba builds survive, so the collector would walk an ever larger heap and free
+    little.
+    """
+
+    def begin(self) -> None:
+        self.was_on = gc.isenabled()
+        gc.disable()
+
+    def end(self) -> None:
+        if self.was_on:
+            gc.enable()
+
+
+class _KnownArithmetic(_Accelerator):
+    """Remember the types that numba infers for operations on plain numbers.
+
+    For every product of two floats numba tries anew all that a product can mean (of strings, lists,
+    arrays, ...), which takes an eighth of the time to compile.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.plain = BaseFunction.get_call_type
+        self.known: dict[tuple[int, tuple[Any, ...]], Any] = {}
+        # References to the functions in `known`, so that no other object gets their ids.
+        self.functions: dict[int, Any] = {}
+
+    def begin(self) -> None:
+        known, functions, plain = self.known, self.functions, self.plain
+
+        def get_call_type(function: Any, context: Any, args: Any, kws: Any) -> Any:
+            if kws or not all(type(kind) in NUMBERS for kind in args):
+                return plain(function, context, args, kws)
+            key = id(function), tuple(args)
+            if key not in known:
+                known[key] = plain(function, context, args, kws)
+                functions[id(function)] = function
+            return known[key]
+
+        setattr(BaseFunction, "get_call_type", get_call_type)  # noqa: B010
+
+    def end(self) -> None:
+        setattr(BaseFunction, "get_call_type", self.plain)  # noqa: B010
+        self.known.clear()
+        self.functions.clear()
+
+
+for _listener in (_Announcement(), _NoGarbageCollection(), _KnownArithmetic()):
     event.register("numba:compile", _listener)  # type: ignore[no-untyped-call]
-
-
-def compiled(function: Function) -> Function:
-    """`numba.njit` with IEEE arithmetic, an on-disk cache, and division by zero giving inf.
-
-    Where no cache folder is writable it warns once and compiles in every process.
-    """
-    return _compile(function)
-
-
-def compiled_in_place(function: Function) -> Function:
-    """`compiled`, and put into its callers by numba, as it stands.
-
-    For large functions with few callers: each level of calls between large functions is optimised
-    all over again, which takes seconds. Not for functions called from parallel loops.
-    """
-    return _compile(function, inline="always")
-
-
-class _Internal(CPUDispatcher):
-    """A compiled function without wrappers; a call from Python makes itself an entry first."""
-
-    def __call__(self, *arguments: Any) -> Any:
-        if not hasattr(self, "_entry"):
-            internal = self
-            self._entry = numba.njit(lambda *given: internal(*given))  # noqa: PLW0108
-        return self._entry(*arguments)
-
-    def get_call_template(self, args: Any, kws: Any) -> Any:
-        # Without this, numba compiles a version of its own for every integer that callers write.
-        plain = {name: _plain(kind) for name, kind in kws.items()}
-        return super().get_call_template([_plain(kind) for kind in args], plain)
-
-
-def _plain(kind: Any) -> Any:
-    """Numba type of a literal integer's value, for its own; any other type as it is."""
-    return kind.literal_type if isinstance(kind, types.IntegerLiteral) else kind
-
-
-def compiled_internal(function: Function) -> Function:
-    """`compiled`, for what compiled code calls: half the wait, for lack of wrappers.
-
-    Unboxing a few arrays takes longer to compile than a short function that works on them. Python
-    may call it too, but compiles an entry in each process: for tests.
-    """
-    return _compile_internal(function)
-
-
-def compiled_inline(function: Function) -> Function:
-    """`compiled_internal`, always inlined by LLVM: for a loop that is to be vectorised."""
-    return _compile_internal(function, forceinline=True)
-
-
-def compiled_parallel(function: Function) -> Function:
-    """`compiled`, its `numba.prange` loops over threads: for loops that call one ordinary function.
-
-    (A body that numba inlines into such a loop was seen to give wrong results.)
-    """
-    return _compile(function, parallel=True, _nrt=True)
-
-
-def compiled_with_lists(*folders: Path) -> Callable[[Function], Function]:
-    """`compiled`, for what makes lists or arrays, as the models of other packages do.
-
-    `folders` hold further sources of what it calls: a change in them makes its cache stale, too.
-    """
-    return lambda function: _compile(function, *folders, _nrt=True)
-
-
-def entry_point(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-    """What a call of a compiled function with such arguments ends in, compiled if need be.
-
-    numba looks up the types of all arguments in every call, which takes as long as to pass them:
-    0.2 us for a handful of arrays. This is the call without it. It takes only arguments of the very
-    same types: an array of another layout would be misread.
-    """
-    if not isinstance(function, numba.core.dispatcher.Dispatcher):
-        return function  # With NUMBA_DISABLE_JIT=1 it is plain Python.
-    entry: Callable[..., Any] = function.compile(tuple(map(numba.typeof, arguments)))
-    return entry
-
-
-def _compile_internal(function: Function, **more: bool) -> Function:
-    dispatcher: Any = _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True, **more)
-    if isinstance(dispatcher, CPUDispatcher):
-        dispatcher.__class__ = _Internal
-    return dispatcher  # type: ignore[no-any-return]
-
-
-def _compile(function: Function, *sources: Path, **more: bool | str) -> Function:
-    # Without numba's runtime there are no references to count, which takes a tenth of the time to
-    # compile; no memory can be had either, but views of arrays can.
-    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False, "_nrt": False, **more}
-    try:
-        dispatcher = numba.njit(cache=True, **options)(function)
-    except RuntimeError:
-        _warn_of_no_cache()
-        return numba.njit(**options)(function)  # type: ignore[no-any-return]
-    here = Path(__file__).parent
-    own = _package(Path(function.__code__.co_filename).parent)
-    index = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if index is not None and hasattr(index, "_source_stamp"):
-        folders = dict.fromkeys((here, here.parent / "lpv_track_env", own, *sources))
-        index._source_stamp = (index._source_stamp, source_digest(*folders))  # noqa: SLF001
-    return dispatcher  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""Curvature: the paper's discrete formula, path statistics, and bands of sharpness."""
+"""Curvature of waypoints, statistics of a path, and bands of curvature."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,18 +12,13 @@ from trajectories.path import ReferencePath
 Array = NDArray[np.float64]
 
 
-def waypoint_curvature(x: ArrayLike, y: ArrayLike) -> Array:
-    """Unsigned curvature |x'y'' - y'x''| / (x'^2 + y'^2)^(3/2) of waypoints, (n,) -> (n,), 1/m.
-
-    kumar2025lpv, evaluated as its figures suggest: central differences, taken twice. At a kink of
-    angle D between waypoints a distance d apart it gives sin(D/2) / (d cos^2(D/2)) at the kink and
-    sin(D) / (4 d) at both neighbours.
-    """
-    return np.abs(signed_waypoint_curvature(x, y))
-
-
 def signed_waypoint_curvature(x: ArrayLike, y: ArrayLike) -> Array:
-    """`waypoint_curvature` with its sign, positive to the left."""
+    """Curvature (x'y'' - y'x'') / (x'^2 + y'^2)^(3/2) of waypoints, (n,) -> (n,), 1/m, left > 0.
+
+    Its absolute value is the formula of kumar2025lpv, evaluated as the paper's figures suggest:
+    central differences, taken twice. At a kink of angle D between waypoints a distance d apart it
+    gives sin(D/2) / (d cos^2(D/2)) at the kink and sin(D) / (4 d) at both neighbours.
+    """
     dx, dy = np.gradient(np.asarray(x, dtype=np.float64)), np.gradient(np.asarray(y, dtype=float))
     ddx, ddy = np.gradient(dx), np.gradient(dy)
     curvature: Array = (dx * ddy - dy * ddx) / (dx * dx + dy * dy) ** 1.5
@@ -33,7 +28,7 @@ def signed_waypoint_curvature(x: ArrayLike, y: ArrayLike) -> Array:
 def circle_curvature(x: ArrayLike, y: ArrayLike) -> Array:
     """Signed curvature of the circle through each point and its neighbours (Menger), (n,), 1/m.
 
-    4 area / (product of the sides); the ends repeat their neighbours' values.
+    4 area / (product of the sides); both ends repeat the value beside them.
     """
     points = np.column_stack([np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)])
     before, after = points[1:-1] - points[:-2], points[2:] - points[1:-1]
@@ -46,7 +41,7 @@ def circle_curvature(x: ArrayLike, y: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class PathStatistics:
-    """The rows of the paper's trajectory table, SI units."""
+    """The rows of the paper's trajectory table, in SI units."""
 
     max_speed: float
     max_acceleration: float
@@ -57,10 +52,10 @@ class PathStatistics:
 
 
 def statistics(path: ReferencePath) -> PathStatistics:
-    """Rows of the paper's trajectory table that a path achieves.
+    """Compute the rows of the paper's trajectory table for a path.
 
-    Total curvature is the literal sum of |kappa_i| over waypoints 0.25 m apart, as read in the
-    project's errata; a closed path's last waypoint, which repeats the first, does not count.
+    Total curvature is the literal sum of |kappa_i| over waypoints 0.25 m apart (see the project's
+    errata); the last waypoint of a closed path, which repeats the first, does not count.
     """
     curvature = np.abs(path.curvature)
     once = curvature[:-1] if path.closed else curvature
@@ -76,22 +71,22 @@ def statistics(path: ReferencePath) -> PathStatistics:
 
 @dataclass(frozen=True)
 class CurvatureBands:
-    """Bands of sharpness on |kappa|: band k lies between thresholds k - 1 and k.
+    """Bands of |kappa|: band k lies between thresholds k - 1 and k.
 
     Parameters
     ----------
     thresholds
-        Increasing, 1/m. The default's 0.005, 0.02 and 0.05 are 1.1, 4.6 and 11.3 degrees of
+        Increasing, 1/m. The defaults 0.005, 0.02 and 0.05 take 1.1, 4.6 and 11.3 degrees of
         steering at a wheelbase of 4 m.
     names
-        One more than thresholds.
+        Names of the bands, one more than thresholds.
     hysteresis
-        Share of a threshold by which |kappa| must fall below it before the band is left downwards.
+        Share of a threshold by which |kappa| must fall below it before a lower band is selected.
 
     Raises
     ------
     ValueError
-        If thresholds do not increase from above 0, or the names do not fit.
+        If thresholds do not increase from above 0, or there are too few or too many names.
     """
 
     thresholds: tuple[float, ...] = (0.005, 0.02, 0.05)
@@ -113,14 +108,15 @@ class CurvatureBands:
         return len(self.names)
 
     def classify(self, curvature: ArrayLike) -> NDArray[np.intp]:
-        """Band index of each |curvature|, shaped like the input; no hysteresis."""
+        """Band index of each |curvature| (1/m), shaped like the input, without hysteresis."""
         return np.searchsorted(np.asarray(self.thresholds), np.abs(curvature), side="right")
 
     def select(self, curvature: Sequence[float] | Array, current: int | None = None) -> int:
-        """Band of the sharpest |curvature| in a preview, with hysteresis against leaving `current`.
+        """Select the band of the largest |curvature| in a preview, with hysteresis from `current`.
 
-        Upwards a threshold acts at once; downwards only once |kappa| is below it by the share
-        `hysteresis`, so a preview that hovers around a threshold does not flicker.
+        A higher band is selected as soon as its threshold is reached, a lower one only after
+        |kappa| has fallen below the threshold by the share `hysteresis`. So the band does not
+        chatter while a preview stays near a threshold.
         """
         sharpest = float(np.max(np.abs(curvature))) if np.size(curvature) else 0.0
         band = int(self.classify(sharpest))
@@ -128,10 +124,3 @@ class CurvatureBands:
             return band
         held = int(self.classify(sharpest / (1.0 - self.hysteresis)))
         return max(band, min(held, current))
-
-    def shares(self, path: ReferencePath) -> Array:
-        """Share of a path's length in each band, (len(self),)."""
-        once = path.curvature[:-1] if path.closed else path.curvature
-        counts = np.bincount(self.classify(once), minlength=len(self))
-        shares: Array = counts / counts.sum()
-        return shares

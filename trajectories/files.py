@@ -1,8 +1,8 @@
-"""Path files: the native CSV, and one `read` for everything that `trajectories` can read.
+"""Path files: the native CSV format, and one `read` for every format that can be read.
 
-The native format "refpath/1": leading `# key: JSON` lines (format, name, closed, points, frame, and
-the path's metadata with the rows it achieves), one header line, then a row for every node. Numbers
-are written so that reading them gives the same bits.
+The native format "refpath/1" has leading `# key: JSON` lines (format, name, closed, points, frame,
+the path's metadata, and its statistics as `achieved`), one header line, then a row for each node.
+Numbers are written so that reading them gives the same bits.
 """
 
 import json
@@ -29,16 +29,17 @@ FORMAT = "refpath/1"
 HEADER = ("s_m", "x_m", "y_m", "psi_rad", "kappa_1pm", "v_mps", "ax_mps2", "t_s")
 FRAME = "local: x, y in m, heading counter-clockwise from x"
 RESERVED = ("format", "name", "closed", "points")
+"""Keys of the header that metadata cannot replace."""
 _COMMENT = re.compile(r"#\s*(?P<key>[A-Za-z_][\w-]*)\s*:\s*(?P<value>.*)")
 
 
 def write(path: ReferencePath, file: str | Path) -> None:
-    """Write a path as native CSV, replacing `file` at once or not at all.
+    """Write a path as native CSV, replacing `file` as a whole or not at all.
 
     Raises
     ------
     ValueError
-        If the metadata holds what JSON does not, with its key.
+        If a value of the metadata cannot be written as JSON; its key is named.
     OSError
         If the file cannot be written.
     """
@@ -69,7 +70,7 @@ def _comment(key: str, value: object) -> str:
 
 
 def _plain(value: object) -> object:
-    """NumPy values as JSON's."""
+    """Convert a NumPy value to one that JSON can hold."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} is not a JSON value")
@@ -83,15 +84,14 @@ def _replace(file: Path, text: str) -> None:
 
 
 def read(file: str | Path) -> ReferencePath:
-    """Read a path, whatever its format: native, racetrack-database, GPS log, or plain x,y.
+    """Read a path of any format: native, racetrack-database, GPS log, or plain x,y.
 
-    The content decides, by its header; the importers have options, which `read` leaves at their
-    defaults.
+    The header decides which. `read` leaves the options of the importers at their defaults.
 
     Raises
     ------
     ValueError
-        In one line that names the file and the line or column at fault.
+        If the file cannot be read; the message names the file and the line or column.
     """
     lines = [line for line in read_text(file).split("\n", 50)[:50] if line.startswith("#")]
     for line in lines:
@@ -109,22 +109,22 @@ def read(file: str | Path) -> ReferencePath:
 def read_native(
     file: str | Path, *, limits: SpeedLimits | None = None, name: str | None = None
 ) -> ReferencePath:
-    """Read a native CSV; the arrays are those that `write` was given, to the bit.
+    """Read a native CSV, with the same bits that `write` was given.
 
     Parameters
     ----------
     file
         CSV file in format "refpath/1".
     limits
-        Plan the speed anew within these; the stored profile is kept if None.
+        Limits to plan the speed anew; None keeps the stored profile.
     name
-        Name instead of the stored one.
+        Name in place of the stored one.
 
     Raises
     ------
     ValueError
-        For a torn file, an unknown format version, a number that is none, arc length that does
-        not increase, or heading and curvature that disagree with the positions.
+        For a torn file, an unknown format version, a cell that is not a number, arc length that
+        does not increase, or heading or curvature that disagree with the positions.
     """
     metadata, table = _split(Path(file))
     columns = dict(zip(HEADER, (table.column(k) for k in range(len(HEADER))), strict=True))
@@ -149,7 +149,7 @@ def read_native(
 
 
 def _split(file: Path) -> tuple[dict[str, Any], TextTable]:
-    """Metadata and table of a native file that is whole."""
+    """Split a native file into metadata and table, after a check that it is complete."""
     table = TextTable(file, HEADER, [], [])
     lines = read_text(file).split("\n")
     metadata = _metadata(lines, table)
@@ -174,7 +174,7 @@ def _split(file: Path) -> tuple[dict[str, Any], TextTable]:
 
 
 def _metadata(lines: list[str], table: TextTable) -> dict[str, Any]:
-    """Values of the leading `# key: JSON` lines, every key once."""
+    """Read the values of the leading `# key: JSON` lines; no key may occur twice."""
     metadata: dict[str, Any] = {}
     for number, line in enumerate(lines, start=1):
         if not line.startswith("#"):
@@ -196,9 +196,10 @@ def _no_constant(text: str) -> NoReturn:
 def _check_geometry(path: ReferencePath, table: TextTable) -> None:
     """Reject arc length, heading or curvature that the positions contradict.
 
-    Heading is compared with central differences, curvature with the circle through three points
-    and with the waypoint formula of raw paths; the better of both counts. The bounds let
-    coordinates rounded to 1 mm pass, and the differences' own error on a grid of 0.25 m.
+    Heading is compared with central differences. Curvature is compared with the circle through
+    three points and with the waypoint formula of raw paths, and must agree with one of them. The
+    bounds allow for coordinates rounded to 1 mm, and for the error of the differences on a grid of
+    0.25 m.
     """
     h = path.spacing
     steps = np.hypot(np.diff(path.x), np.diff(path.y))
@@ -225,7 +226,7 @@ def _reject(wrong: NDArray[np.bool_], offset: int, message: str, table: TextTabl
 
 
 def _check_motion(path: ReferencePath, columns: dict[str, Array], table: TextTable) -> None:
-    """Warn of acceleration or time that do not follow from the speeds, which are what counts."""
+    """Warn if the columns of acceleration or time do not follow from the speeds, which are used."""
     for key, values, tolerance in (
         ("ax_mps2", path.acceleration, 1e-3),
         ("t_s", path.time, 1e-3 + 1e-4 * path.duration),

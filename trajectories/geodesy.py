@@ -1,4 +1,4 @@
-"""Geodetic positions on the WGS-84 ellipsoid as metres east, north and up of an origin."""
+"""Convert WGS-84 positions to metres east, north and up of an origin, and back."""
 
 import math
 
@@ -7,36 +7,46 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+# WGS-84 ellipsoid: semi-major axis (m), flattening, and the square of the eccentricity.
 EQUATOR, FLATTENING = 6_378_137.0, 1.0 / 298.257223563
-"""WGS-84 ellipsoid: semi-major axis, m, and flattening."""
+ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 LATITUDE_ITERATIONS = 8
-"""Each leaves e^2 = 0.0067 of the last one's error: to rounding for points near the ground."""
+"""Each leaves e^2 = 0.0067 of the error: enough to reach rounding for points near the ground."""
 
 
 def earth_centred(latitude: Array, longitude: Array, height: Array) -> Array:
     """Earth-centred coordinates (n, 3), m, of WGS-84 latitude, longitude (deg) and height (m)."""
     phi, lam = np.radians(latitude), np.radians(longitude)
-    square = FLATTENING * (2.0 - FLATTENING)  # e^2
-    normal = EQUATOR / np.sqrt(1.0 - square * np.sin(phi) ** 2)  # N(phi)
+    normal = _normal_radius(phi)
     return np.column_stack(
         [
             (normal + height) * np.cos(phi) * np.cos(lam),
             (normal + height) * np.cos(phi) * np.sin(lam),
-            ((1.0 - square) * normal + height) * np.sin(phi),
+            ((1.0 - ECCENTRICITY_SQUARED) * normal + height) * np.sin(phi),
         ]
     )
+
+
+def _normal_radius(phi: Array) -> Array:
+    """Radius of curvature N (m) of the ellipsoid across the meridian, at latitudes phi (rad)."""
+    radius: Array = EQUATOR / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(phi) ** 2)
+    return radius
+
+
+def _plane(origin: tuple[float, float, float]) -> tuple[Array, Array]:
+    """Earth-centred place of an origin (1, 3), m, and directions east, north, up there (3, 3)."""
+    phi, lam = math.radians(origin[0]), math.radians(origin[1])
+    sp, cp, sl, cl = math.sin(phi), math.cos(phi), math.sin(lam), math.cos(lam)
+    axes = np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
+    return earth_centred(*(np.array([value]) for value in origin)), axes
 
 
 def east_north_up(
     latitude: Array, longitude: Array, height: Array, origin: tuple[float, float, float]
 ) -> Array:
     """Coordinates (n, 3), m, in the plane that touches the ellipsoid at an origin (deg, deg, m)."""
-    offset = earth_centred(latitude, longitude, height)
-    offset = offset - earth_centred(*(np.array([value]) for value in origin))
-    phi, lam = math.radians(origin[0]), math.radians(origin[1])
-    sp, cp, sl, cl = math.sin(phi), math.cos(phi), math.sin(lam), math.cos(lam)
-    axes = np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
-    turned: Array = offset @ axes.T
+    place, axes = _plane(origin)
+    turned: Array = (earth_centred(latitude, longitude, height) - place) @ axes.T
     return turned
 
 
@@ -45,20 +55,14 @@ def geodetic(points: Array, origin: tuple[float, float, float]) -> tuple[Array, 
 
     `points` are (n, 3) m east, north and up of an origin (deg, deg, m), within some 1000 km of it.
     """
-    phi, lam = math.radians(origin[0]), math.radians(origin[1])
-    sp, cp, sl, cl = math.sin(phi), math.cos(phi), math.sin(lam), math.cos(lam)
-    axes = np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
-    at = points @ axes + earth_centred(*(np.array([value]) for value in origin))
-    square = FLATTENING * (2.0 - FLATTENING)  # e^2
+    place, axes = _plane(origin)
+    at = points @ axes + place
     across = np.hypot(at[:, 0], at[:, 1])
-    latitude = np.arctan2(at[:, 2], across * (1.0 - square))
+    latitude = np.arctan2(at[:, 2], across * (1.0 - ECCENTRICITY_SQUARED))
     for _ in range(LATITUDE_ITERATIONS):
-        normal = EQUATOR / np.sqrt(1.0 - square * np.sin(latitude) ** 2)  # N(phi)
-        latitude = np.arctan2(at[:, 2] + square * normal * np.sin(latitude), across)
-    normal = EQUATOR / np.sqrt(1.0 - square * np.sin(latitude) ** 2)
+        lift = ECCENTRICITY_SQUARED * _normal_radius(latitude) * np.sin(latitude)
+        latitude = np.arctan2(at[:, 2] + lift, across)
     # Without a division by cos(phi) or sin(phi), which vanish at the poles and the equator.
-    height = (
-        across * np.cos(latitude) + at[:, 2] * np.sin(latitude)
-        - EQUATOR**2 / normal
-    )  # fmt: skip
+    height = across * np.cos(latitude) + at[:, 2] * np.sin(latitude)
+    height = height - EQUATOR**2 / _normal_radius(latitude)
     return np.degrees(latitude), np.degrees(np.arctan2(at[:, 1], at[:, 0])), height

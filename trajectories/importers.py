@@ -1,7 +1,8 @@
 """Import foreign paths: racing circuits, plain x,y lists, GPS logs.
 
-All go one way: checks, a smoothing spline whose deviation is reported, resampling at 0.25 m of arc
-length, heading and curvature from the spline's derivatives, a jerk-limited speed profile.
+Every import takes the same steps: checks, a smoothing spline whose deviation is reported,
+resampling at 0.25 m of arc length, heading and curvature from the spline's derivatives, and a
+jerk-limited speed profile.
 """
 
 import math
@@ -15,31 +16,34 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from trajectories.catalog import from_geometry
 from trajectories.fileio import COLUMNS, TextTable, is_number, read_table
 from trajectories.geodesy import east_north_up
 from trajectories.path import MINIMUM_POINTS, SPACING, ReferencePath
-from trajectories.shapes import Geometry
-from trajectories.smoothing import smooth
+from trajectories.shapes import Geometry, from_geometry, smooth
 from trajectories.speed import SpeedLimits
 
 Array = NDArray[np.float64]
 
 IMPORT_LIMITS = SpeedLimits(max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5)
-"""Speed limits of an imported path unless given: those of the analytic shapes, from 1.5 m/s."""
+"""Default speed limits of an imported path: as for analytic shapes, but starting at 1.5 m/s."""
 SMOOTHING = 0.05
-"""m rms: takes the jitter out of 5 m points (largest curvature 0.162 to 0.104 1/m on one track)."""
+"""m rms: removes the jitter of points 5 m apart (on one track the largest curvature falls from
+0.162 to 0.104 1/m)."""
 GPS_SMOOTHING = 0.2
 """m rms."""
 MAX_STEERING_ANGLE = math.pi / 6
-"""rad, of every vehicle of the project (kumar2025lpv, constraint table)."""
+"""rad, as in the constraint table of kumar2025lpv."""
 
 DUPLICATE = 1e-3
+"""m: points closer than this to the one before are merged."""
 GAP_FACTOR = 10.0
+"""Multiple of the median distance from which a gap is warned of."""
 APPROACH, APPROACH_ALONG = 2.5, 20.0
+"""m: a path approaches itself if it comes this close to a place this far away along the path."""
 MINIMUM_LENGTH, MAXIMUM_LENGTH = 1.0, 30_000.0
+"""m: other lengths suggest that the coordinates are not metres."""
 LARGEST_COORDINATE = 1e7
-"""All in m but the factor; a coordinate beyond the last is not on Earth's map."""
+"""m: larger coordinates are not on any map of the Earth."""
 
 
 def read_racetrack(
@@ -51,27 +55,27 @@ def read_racetrack(
     smoothing: float = SMOOTHING,
     name: str | None = None,
 ) -> ReferencePath:
-    """Import a centre line of the racetrack-database, `# x_m,y_m,w_tr_right_m,w_tr_left_m`.
+    """Import a centre line in the racetrack-database format, `# x_m,y_m,w_tr_right_m,w_tr_left_m`.
 
     Parameters
     ----------
     file
-        CSV file; the widths are not used.
+        CSV file; the track widths are not used.
     closed
-        Circuits are; None looks at whether the ends meet.
+        Whether the track is a circuit; None decides by whether the ends meet.
     scale
-        Factor on all coordinates, to fit a circuit to a vehicle.
+        Factor on all coordinates, to fit a track to a vehicle.
     limits
         Speed limits; the default is 10 m/s, 2 m/s^2 laterally, 1.5 m/s^2 longitudinally.
     smoothing
         Largest rms deviation of the path from the (scaled) points, m; 0 interpolates.
     name
-        The file's stem unless given.
+        Name of the path; by default the file's stem.
 
     Raises
     ------
     ValueError
-        For a file that cannot be read or is no drivable path, naming line and column.
+        If the file cannot be read or is no drivable path; the message names line and column.
     """
     table = read_table(file)
     if len(table.rows[0]) != 4 or (table.header and table.find("width") is None):
@@ -90,16 +94,16 @@ def read_xy(
     smoothing: float = SMOOTHING,
     name: str | None = None,
 ) -> ReferencePath:
-    """Import waypoints x,y in metres; further columns need a header that names x and y.
+    """Import waypoints x,y in metres; files with more columns need a header that names x and y.
 
-    Parameters are those of `read_racetrack`; `closed` None takes the path as closed if its ends
-    are within 1.5 times the spacing (median, first or last) and the direction goes on from one to
-    the other.
+    Parameters are those of `read_racetrack`. With `closed` None the path counts as closed if its
+    ends are within 1.5 times the spacing (median, first or last) and the direction continues from
+    the end to the start.
 
     Raises
     ------
     ValueError
-        For a file that cannot be read, is no drivable path, or looks like degrees.
+        If the file cannot be read, is no drivable path, or seems to be in degrees.
     """
     table = read_table(file)
     x, y = table.find("x"), table.find("y")
@@ -143,18 +147,18 @@ def read_gps(
         As in `read_xy`.
     origin
         Latitude and longitude (deg) and height (m) of x = y = 0; the first point unless given.
-        x points east and y north there. It is kept in `metadata["origin"]`.
+        There x points east and y north. It is stored in `metadata["origin"]`.
     minimum_distance
-        m: points nearer than this to the last one kept are dropped (standstill), counted in
-        `metadata["dropped"]`.
+        m: points closer than this to the last kept one are dropped (standstill); their number is
+        in `metadata["dropped"]`.
     limits, smoothing, name
-        As in `read_racetrack`; consumer receivers may need more `smoothing`.
+        As in `read_racetrack`; logs of consumer receivers may need more `smoothing`.
 
     Raises
     ------
     ValueError
-        For a file that cannot be read, angles out of range, time that goes back, or no drivable
-        path.
+        If the file cannot be read, angles are out of range, time goes back, or the points are no
+        drivable path.
     """
     table = read_table(file)
     columns = {key: table.find(key) for key in ("latitude", "longitude", "height", "time")}
@@ -190,7 +194,7 @@ def read_gps(
 
 
 def _times(table: TextTable, index: int) -> Array:
-    """Seconds (n,) from a column of numbers or ISO 8601 stamps."""
+    """Read times (n,), s, from a column of numbers or of ISO 8601 stamps."""
     if is_number(table.rows[0][index]):
         return table.column(index)
     stamps = np.empty(len(table.rows))
@@ -204,7 +208,7 @@ def _times(table: TextTable, index: int) -> Array:
 
 @dataclass
 class _Importer:
-    """From points to a path, for one file: checks, spline, speed, and what there is to warn of."""
+    """Make a path from the points of one file: checks, spline, speed profile, warnings."""
 
     table: TextTable
     kind: str
@@ -214,12 +218,12 @@ class _Importer:
     warnings: list[str] = field(default_factory=list)
 
     def warn(self, message: str) -> None:
-        """Warn of something that is accepted, and keep it for the path's metadata."""
+        """Warn of a flaw that is accepted, and keep the message for the path's metadata."""
         self.warnings.append(message)
         warnings.warn(f"{self.table.file}: {message}", stacklevel=5)
 
     def scaled(self, points: Array, scale: float) -> Array:
-        """Scale points (n, 2), and keep the factor."""
+        """Scale points (n, 2), and keep the factor for the metadata."""
         if not (math.isfinite(scale) and scale > 0.0):
             raise ValueError(f"scale must be positive, not {scale}")
         if scale != 1.0:
@@ -227,7 +231,7 @@ class _Importer:
         return points * scale
 
     def thinned(self, points: Array, distance: float) -> Array:
-        """Points (m, 2) at least `distance` from the one kept before them, and their lines."""
+        """Keep points (m, 2) at least `distance` (m) from the last kept one, and their lines."""
         kept = [0]
         for k in range(1, len(points)):
             if math.dist(points[k], points[kept[-1]]) >= distance:
@@ -256,11 +260,11 @@ class _Importer:
                 warnings=self.warnings,
                 **self.metadata,
             )  # fmt: skip
-        except RuntimeError as error:  # the linear programme found no profile
+        except RuntimeError as error:  # no speed profile found
             raise ValueError(f"{self.table.file}: {error}") from error
 
     def _checked(self, points: Array) -> Array:
-        """Points (m, 2) without duplicates, enough of them and none too far away."""
+        """Merge duplicates to points (m, 2); reject too few, or coordinates too large."""
         far = np.flatnonzero(np.abs(points).max(axis=1) > LARGEST_COORDINATE)
         if far.size:
             self.table.fail(f"line {self.table.lines[far[0]]}: coordinate beyond 1e7 m")
@@ -274,7 +278,7 @@ class _Importer:
         return points
 
     def _ends(self, points: Array, closed: bool | None) -> tuple[Array, bool]:
-        """Points without a repeated start, and whether the path is closed."""
+        """Return the points without a repeated start, and whether the path is closed."""
         gap = points[0] - points[-1]
         repeated = bool(np.hypot(*gap) < DUPLICATE)
         if closed is None:
@@ -291,7 +295,7 @@ class _Importer:
         return points, closed
 
     def _check_steps(self, points: Array, closed: bool) -> None:
-        """Reject reversals and lengths that are no path's; warn of gaps."""
+        """Reject reversals and impossible lengths; warn of gaps."""
         steps = np.diff(np.vstack([points, points[:1]]) if closed else points, axis=0)
         distances = np.hypot(*steps.T)
         length = float(distances.sum())
@@ -321,7 +325,7 @@ class _Importer:
             )
 
     def _check_curve(self, geometry: Geometry, closed: bool) -> None:
-        """Warn of bends beyond the steering, and of branches that come near each other."""
+        """Warn of bends that no vehicle can steer, and of branches close to each other."""
         curvature = np.abs(geometry.curvature)
         sharpest = int(np.argmax(curvature))
         steerable = math.tan(MAX_STEERING_ANGLE) / self.limits.wheelbase
@@ -341,11 +345,12 @@ class _Importer:
 
 
 def self_approach(geometry: Geometry, closed: bool) -> tuple[float, float, float] | None:
-    """Arc lengths and distance (m) where a path is nearest to itself, if under 2.5 m.
+    """Find where a path comes closest to itself: two arc lengths and their distance, m.
 
-    Only points more than 20 m apart along the path count; a closed path's seam joins its ends.
+    None if no points that lie more than 20 m apart along the path (across the seam too if it is
+    closed) are closer than 2.5 m.
     """
-    stride = 2  # 0.5 m: nearest nodes are at most 0.35 m further apart than the branches
+    stride = 2  # 0.5 m: the nearest nodes are at most 0.35 m further apart than the branches
     s = geometry.arc_length[::stride]
     points = np.column_stack([geometry.x[::stride], geometry.y[::stride]])
     pairs = cKDTree(points).query_pairs(APPROACH, output_type="ndarray")

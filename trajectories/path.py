@@ -8,21 +8,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trajectories import interpolation, projection
-from trajectories import preview as previewing
+from trajectories import projection, table
 
 SPACING = 0.25
-"""m, the grid of arc length that every path is kept on (up to fitting its length exactly)."""
+"""m between nodes of every path, up to fitting its length exactly."""
 MINIMUM_POINTS = 4
 MINIMUM_SPEED = 0.05
+"""m/s; a slower reference would take too long to arrive."""
 SEAM_GAP = 2e-3
-"""m, and share of a turn: how exactly the ends of a closed path join."""
+"""Largest gap between the ends of a closed path, in m and, for the heading, in turns."""
 
 Array = NDArray[np.float64]
 
 
 class PathSample(NamedTuple):
-    """A path's quantities at some arc lengths, each shaped like the arc length asked for."""
+    """A path's quantities at given arc lengths, each shaped like the arc length; SI units."""
 
     x: Array
     y: Array
@@ -43,14 +43,14 @@ class Projection(NamedTuple):
 
 
 class Preview(NamedTuple):
-    """The reference over the next periods of its own time, see `ReferencePath.preview`."""
+    """The reference over the next periods of its own time; see `ReferencePath.preview`."""
 
     curvature: Array
     speed: Array
 
 
 def _finite(what: str, values: ArrayLike) -> Array:
-    """Array of values of any shape, after a check that compiled code can take them."""
+    """Return values of any shape as an array; raise a ValueError unless all are finite."""
     array = np.asarray(values, dtype=np.float64)
     if not np.isfinite(array).all():
         raise ValueError(f"{what} must be finite, not {values!r}")
@@ -76,17 +76,17 @@ class ReferencePath:
     name
         Name for reports.
     closed
-        Whether the end joins the start (the last node repeats the first, heading up to whole
-        turns).
+        Whether the end joins the start: the last node repeats the first, its heading up to whole
+        turns.
     metadata
-        Plain JSON values: source, published and achieved rows, limits used, warnings.
+        Plain JSON values: source, published and achieved statistics, speed limits, warnings.
 
     Raises
     ------
     ValueError
-        For fewer than 4 points, unequal lengths, a value that is not finite (with its column and
-        index), arc length that does not start at 0, increase and stay uniform, a closed path whose
-        ends do not join, or speed under 0.05 m/s.
+        If there are fewer than 4 points, lengths differ, a value is not finite (its column and
+        index are named), arc length does not start at 0 or is not uniform, the ends of a closed
+        path do not join, or a speed is below 0.05 m/s.
     """
 
     arc_length: Array
@@ -155,82 +155,73 @@ class ReferencePath:
 
     @property
     def spacing(self) -> float:
-        """Distance of nodes along the path, m."""
+        """Arc length between two nodes, m."""
         return self.length / (len(self.arc_length) - 1)
 
     @cached_property
     def time(self) -> Array:
-        """(n,) time at which the reference passes each node, s; acceleration constant in a cell."""
+        """(n,) time of the reference at each node, s; its acceleration is constant in a cell."""
         steps = 2.0 * self.spacing / (self.speed[1:] + self.speed[:-1])
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     @cached_property
     def acceleration(self) -> Array:
-        """(n,) tangential acceleration of the cell that follows each node, m/s^2."""
+        """(n,) tangential acceleration in the cell after each node, m/s^2."""
         cells = np.diff(self.speed**2) / (2.0 * self.spacing)
         return np.append(cells, cells[0] if self.closed else cells[-1])
 
     @property
     def duration(self) -> float:
-        """Time that the reference takes from start to end, s."""
+        """Time of the reference from start to end, s."""
         return float(self.time[-1])
 
     @cached_property
     def table(self) -> Array:
-        """(n, 8) nodes as compiled code takes them, columns as in `trajectories.interpolation`."""
-        return np.ascontiguousarray(
-            np.column_stack(
-                [
-                    self.x,
-                    self.y,
-                    np.cos(self.heading),
-                    np.sin(self.heading),
-                    self.heading,
-                    self.curvature,
-                    self.speed,
-                    self.time,
-                ]
-            )
-        )
+        """(n, 8) nodes for compiled code, with the columns of `trajectories.table`."""
+        columns = (
+            self.x, self.y, np.cos(self.heading), np.sin(self.heading), self.heading,
+            self.curvature, self.speed, self.time,
+        )  # fmt: skip
+        return np.ascontiguousarray(np.column_stack(columns))
 
     def sample(self, s: ArrayLike) -> PathSample:
-        """Interpolate at arc lengths s (m, any shape), wrapped if closed, clamped if open."""
+        """Interpolate at arc lengths s (m, any shape): wrapped if closed, clamped if open."""
         s = _finite("arc length", s)
         rows = np.empty((s.size, 7))
         for k, value in enumerate(s.ravel()):
             arguments = (self.table, self.length, self.closed, float(value))
-            index, _ = interpolation.cell(float(value), self.length, self.closed, len(self.x))
+            index, _ = table.cell(float(value), self.length, self.closed, len(self.x))
             rows[k] = (
-                *interpolation.position_at(*arguments),
-                interpolation.heading_at(*arguments),
-                interpolation.curvature_at(*arguments),
-                interpolation.speed_at(*arguments),
+                *table.position_at(*arguments),
+                table.heading_at(*arguments),
+                table.curvature_at(*arguments),
+                table.speed_at(*arguments),
                 self.acceleration[index],
-                interpolation.time_at(*arguments),
+                table.time_at(*arguments),
             )
         return PathSample(*(column.reshape(s.shape) for column in rows.T))
 
     def project(self, x: float, y: float, near: float | None = None) -> Projection:
         """Foot point of the position (x, y), m.
 
-        With `near` (an arc length, m) only the path within 3 m of it is searched, so the answer
-        stays on the local branch of a path that crosses or approaches itself; without, all of it.
+        With `near` (an arc length, m), search only the path within 3 m of it: the foot point stays
+        on the local branch of a path that crosses or approaches itself. Without, search all of it.
         The lateral error is positive to the left of the path.
         """
         _finite("position", (x, y) if near is None else (x, y, near))
-        start, window = (0.5 * self.length, self.length) if near is None else (near, 3.0)
-        if near is None and self.closed:
-            window = 0.5 * self.length
+        start, window = 0.5 * self.length, (0.5 if self.closed else 1.0) * self.length
+        if near is not None:
+            start, window = near, projection.SEARCH_WINDOW
         s, lateral_error, heading, curvature = projection.project(
             self.table, self.length, self.closed, float(x), float(y), float(start), window
         )
         return Projection(s, lateral_error, heading, curvature)
 
     def arc_length_at(self, time: ArrayLike) -> Array:
-        """Arc length that the reference has reached at some times (s) after its start, m."""
+        """Arc length of the reference at times (s, any shape) after its start, m."""
         times = _finite("time", time)
         values = [
-            interpolation.arc_length_at(self.table, self.length, self.closed, float(t), 0)[0]
+            table.arc_length_at(self.table, self.length, self.closed, float(t), 0)[0]
             for t in times.ravel()
         ]
         return np.array(values).reshape(times.shape)
@@ -243,7 +234,7 @@ class ReferencePath:
         """
         _finite("arc length and period", (s, period))
         values = np.empty(2 * count)
-        previewing.preview(self.table, self.length, self.closed, float(s), float(period), values)
+        table.preview(self.table, self.length, self.closed, float(s), float(period), values)
         return Preview(values[:count], values[count:])
 
     def with_speed(self, speed: ArrayLike, **metadata: Any) -> "ReferencePath":
@@ -254,12 +245,9 @@ class ReferencePath:
     def mirrored(self) -> "ReferencePath":
         """Return the path reflected at the x axis: left and right exchanged."""
         return replace(
-            self,
-            y=-self.y,
-            heading=-self.heading,
-            curvature=-self.curvature,
+            self, y=-self.y, heading=-self.heading, curvature=-self.curvature,
             name=f"{self.name}-mirrored",
-        )
+        )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
         cached = {"table", "time", "acceleration"}

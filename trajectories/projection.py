@@ -1,7 +1,7 @@
 """Compiled projection: the foot point of a position on a path's table.
 
-The search stays within a window around the last arc length, so on the local branch of a path that
-crosses or approaches itself.
+The search stays within a window around the last arc length, and so on the local branch of a path
+that crosses or approaches itself.
 """
 
 import math
@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from trajectories.compilation import compiled, compiled_inline, compiled_internal
-from trajectories.interpolation import (
+from trajectories.table import (
     COS,
     CURVATURE,
     HEADING,
@@ -25,17 +25,18 @@ from trajectories.interpolation import (
 )
 
 SEARCH_WINDOW = 3.0
-"""m: projection looks this far around the last arc length, so it stays on the local branch."""
+"""m to each side of the last arc length."""
 NEWTON_STEPS = 8
-"""At most; two or three are the rule."""
+"""Largest number of steps; two or three are usual."""
 NEWTON_TOLERANCE = 1e-6
-"""Of a cell: Newton's method stops after a step below it, for the next would be its square."""
+"""Share of a cell: Newton's method stops after a smaller step, for the next would be its square."""
 FAR = 1.0e300
+"""m^2, larger than any squared distance."""
 
 
 @compiled_internal
 def squared_distance(table: Table, closed: bool, x: Float, y: Float, node: int) -> Float:
-    """Squared distance of a point from a node, m^2; on a closed path nodes go on over laps."""
+    """Squared distance of a point from a node, m^2; on a closed path nodes count on over laps."""
     if closed:
         node %= table.shape[0] - 1
     dx, dy = x - table[node, X], y - table[node, Y]
@@ -44,9 +45,9 @@ def squared_distance(table: Table, closed: bool, x: Float, y: Float, node: int) 
 
 @compiled_internal
 def nearest_node(table: Table, closed: bool, x: Float, y: Float, first: int, last: int) -> int:
-    """Index of the node nearest to a point, of those from `first` to `last`; of equals the first.
+    """Index of the node nearest to a point from `first` to `last`; the first of equally near ones.
 
-    On a closed path the indices go on over laps.
+    On a closed path the indices count on over laps.
     """
     best, best_distance = first, FAR
     for k in range(first, last + 1):
@@ -61,15 +62,15 @@ def nearest_node_downhill(
     table: Table, closed: bool, x: Float, y: Float, first: int, last: int, guess: int,
     spacing: Float, tightest: Float,
 ) -> int:  # fmt: skip
-    """Index of the nearest node as `nearest_node` gives it, in a few steps from a good `guess`.
+    """Index of the nearest node, as `nearest_node` finds it, in a few steps from a good `guess`.
 
     The squared distance falls monotonically to one minimum among these nodes if the path curves
-    gently enough. With K = `tightest` the largest curvature (see `tightest_turn`), d the distance
-    at a local minimum and W the arc length from there to the far end of the searched nodes: along
+    gently enough. Let K = `tightest` be the largest curvature (see `tightest_turn`), d the distance
+    at a local minimum and W the arc length from there to the far end of the searched nodes. Along
     the path, the point's longitudinal and lateral offsets f, e in the path's frame follow
     f' = -1 + kappa e, e' = -kappa f, and half the squared distance has the second derivative
     1 - kappa e. While K |e| < 1, |f'| < 2, so |e| <= d + K W^2: K (d + K W^2) < 1 makes the
-    distance convex on all of it. Where that fails, all nodes are searched.
+    distance convex over all searched nodes. Where that fails, every node is compared.
     """
     node = min(max(guess, first), last)
     distance = squared_distance(table, closed, x, y, node)
@@ -80,12 +81,12 @@ def nearest_node_downhill(
         node, distance = node + 1, ahead
     while node > first:
         behind = squared_distance(table, closed, x, y, node - 1)
-        # Of equals the first, as in `nearest_node`.
+        # The first of equally near nodes, as in `nearest_node`.
         if not behind <= distance:
             break
         node, distance = node - 1, behind
     if first < node < last:
-        # One more spacing, for f is not quite 0 at a node.
+        # One more spacing, because f is not exactly 0 at a node.
         turn = tightest * (max(node - first, last - node) + 1) * spacing
         margin = 1.0 - turn * turn
         if margin > 0.0 and tightest * tightest * distance < margin * margin:
@@ -97,10 +98,11 @@ def nearest_node_downhill(
 def foot_point(
     table: Table, h: Float, closed: bool, x: Float, y: Float, node: int
 ) -> tuple[int, Float, Float]:
-    """Foot point of (x, y) beside a node: cell (counted over laps), u in [0, 1], lateral error.
+    """Foot point of (x, y) near a node: cell (counted over laps), u in [0, 1], lateral error.
 
-    The squared distance from the cell's Hermite cubic is brought to its minimum by Newton's method
-    in the cell towards which it falls at the node. The lateral error is positive to the left.
+    Of the two cells at the node, take the one towards which the squared distance falls, and
+    minimise the squared distance from its Hermite cubic by Newton's method. The lateral error is
+    positive to the left.
     """
     n = table.shape[0]
     base = node % (n - 1) if closed else node
@@ -123,7 +125,7 @@ def foot_point(
         step = (dx * tx + dy * ty) / max(tx * tx + ty * ty - bend, low)
         before = u
         u = min(max(u + step, 0.0), 1.0)
-        # Newton's error squares from step to step: the next would be far below rounding.
+        # The error squares from step to step: the next step would be far below rounding.
         if not abs(u - before) > NEWTON_TOLERANCE:
             break
     dx, dy = x0 - u * (x1 + u * (x2 + u * x3)), y0 - u * (y1 + u * (y2 + u * y3))
@@ -135,7 +137,7 @@ def foot_point(
 def searched_nodes(
     n: int, spacing: Float, closed: bool, near: Float, window: Float
 ) -> tuple[int, int]:
-    """First and last node that a projection near an arc length searches."""
+    """First and last node within `window` (m) of the arc length `near`."""
     middle = math.floor(near / spacing + 0.5)
     reach = math.ceil(window / spacing)
     if closed:
@@ -146,7 +148,7 @@ def searched_nodes(
 
 @compiled_internal
 def arc_length_in(length: Float, closed: bool, n: int, index: int, u: Float) -> Float:
-    """Arc length at u of a cell (counted over laps), m; exactly `length` at an open path's end."""
+    """Arc length at u in a cell (counted over laps), m; exactly `length` at an open path's end."""
     if not closed and index == n - 2 and u >= 1.0:
         return length
     return (index + u) * (length / (n - 1))
@@ -158,9 +160,9 @@ def project(
 ) -> tuple[Float, Float, Float, Float]:
     """Foot point of (x, y): arc length, lateral error, heading and curvature there.
 
-    Nodes within `window` of the arc length `near` are searched, then the foot point is refined by
-    Newton's method. The lateral error is positive to the left of the path. On a closed path the
-    arc length runs on over laps with `near`. On an open path it lies within [0, length].
+    The nearest node within `window` of the arc length `near` is found first, then the foot point by
+    Newton's method. The lateral error is positive to the left of the path. The arc length counts on
+    over laps with `near` on a closed path, and lies within [0, length] on an open one.
     """
     n = table.shape[0]
     h = length / (n - 1)
@@ -177,16 +179,16 @@ def follow(
     table: Table, length: Float, closed: bool, x: Float, y: Float,
     near: Float, ahead: Float, window: Float, tightest: Float,
 ) -> tuple[Float, Float, Float, int, Float, int]:  # fmt: skip
-    """Foot point of (x, y) that came from `near` and should be about `ahead` m further on.
+    """Foot point of (x, y), expected about `ahead` m further on than the last one at `near`.
 
-    The same foot point as of `project`, found faster; `tightest` as `tightest_turn` gives it.
-    Returns arc length, lateral error, heading (running on over laps), and, for `fill_preview` and
-    the rest, cell, u in it and laps before it.
+    The foot point equals that of `project` but is found faster; `tightest` is the result of
+    `tightest_turn`. Returns arc length, lateral error, heading (counting on over laps), cell (on
+    the first lap), u in it, and the number of laps before it.
     """
     n = table.shape[0]
     h = length / (n - 1)
     first, last = searched_nodes(n, h, closed, near, window)
-    # A guess however absurd is clipped to the window before it becomes an integer.
+    # Clip the guess to the window before it becomes an integer, however absurd it is.
     guess = math.floor((near + min(max(ahead, -window), window)) / h + 0.5)
     node = nearest_node_downhill(table, closed, x, y, first, last, guess, h, tightest)
     index, u, lateral_error = foot_point(table, h, closed, x, y, node)
@@ -202,10 +204,9 @@ def follow(
 
 
 def tightest_turn(table: Table, closed: bool) -> float:
-    """Largest curvature of a path's table, 1/m: of its column, its headings and its polyline.
+    """Largest curvature of a path's table, 1/m, by its column, its headings or its polyline.
 
-    The largest of the three, so that it bounds the path's bends even where the columns of a given
-    file do not agree.
+    The largest of the three bounds the path's bends even where the columns of a file disagree.
     """
     steps = np.diff(table[:, [X, Y]], axis=0)
     if closed:

@@ -1,32 +1,50 @@
-"""Path geometry: the segment language, parametric curves, kinked polylines.
+"""Path geometry from segments, from parametric curves, and from measured points.
 
-A path is one readable line: straights in metres, turns in degrees with their apex radius in metres,
-optionally the length of the transitions and the share of lateral acceleration that the turn uses::
+Segments are written in one readable line: straights in metres, turns in degrees with their apex
+radius in metres, optionally the length of their transitions (m) and the share of the lateral
+acceleration that the turn uses::
 
     S 45 | L 90 r11 | S 40 | R 60 r20 t15 a0.8
 
 A turn's curvature is a Bloss ramp (3u^2 - 2u^3), an arc and a Bloss ramp, so curvature is
 continuously differentiable and its integral, the heading, has a closed form. Arc length is the
 parameter, so lengths are exact; positions are Gauss-Legendre quadratures of the tangent.
+
+Measured points become a penalised smoothing spline. Splines with few knots
+(`scipy.interpolate.make_splprep`) reach a given deviation with as few knots as they can, and
+wiggle: a sine with peaks of 0.049 1/m comes back with 0.15 1/m at 0.1 m rms. Here knots are as
+dense as the points and roughness has a price instead (P-splines: Eilers and Marx, 1996), so more
+smoothing never sharpens a bend much; closed curves are exactly periodic.
 """
 
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.sparse.linalg import splu
 
-from trajectories.path import SPACING
-from trajectories.speed import SpeedLimits
+from trajectories.path import SPACING, ReferencePath
+from trajectories.speed import SpeedLimits, plan_speed
 
 Array = NDArray[np.float64]
 Derivatives: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 """x, y, their first and their second derivatives, each (n,)."""
 
-TRANSITION_RATE_SHARE = 1.0
+DEGREE = 5
+"""Degree of the smoothing splines."""
+LEAST_KNOT_SPACING = 0.5
+"""m: denser points do not need denser knots."""
+PENALTY_EXPONENTS = (-8.0, 6.0)
+"""Powers of ten between which the penalty on roughness is bisected."""
+PENALTY_RESOLUTION = 0.05
+"""Width of the bracket, in powers of ten, at which the bisection ends."""
+
 _SEGMENT = re.compile(
     r"^(?:S\s*(?P<straight>[\d.]+)"
     r"|(?P<side>[LR])\s*(?P<angle>[\d.]+)\s+r\s*(?P<radius>[\d.]+)"
@@ -38,7 +56,10 @@ _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 
 
 class Geometry(NamedTuple):
-    """A path without speed: (n,) arrays on a uniform grid of arc length, and each turn's share."""
+    """A path without speed: (n,) arrays on a uniform grid of arc length.
+
+    `share` is the share of the lateral acceleration limit that the speed may use at a point.
+    """
 
     arc_length: Array
     x: Array
@@ -50,7 +71,7 @@ class Geometry(NamedTuple):
 
 @dataclass(frozen=True)
 class Segment:
-    """A straight (turn 0) of some length (m), or a turn of some angle (rad, left positive)."""
+    """A straight (`turn` 0) with a length (m), or a turn by an angle (rad, left positive)."""
 
     length: float = 0.0
     turn: float = 0.0
@@ -60,12 +81,12 @@ class Segment:
 
 
 def parse(text: str) -> list[Segment]:
-    """Read the segment language.
+    """Read segments from text; see the module for its language.
 
     Raises
     ------
     ValueError
-        Naming the segment that cannot be read, or a number that is not positive.
+        If a segment cannot be read or has a number that is not positive; the segment is named.
     """
     segments = []
     for position, part in enumerate(text.split("|"), start=1):
@@ -108,13 +129,13 @@ def fit(
 ) -> list[Segment]:
     """Scale all turn angles to a total turning (rad) and all straights to a total length (m).
 
-    Transitions that were not given become as long as the steering rate needs at the turn's speed:
-    a Bloss ramp of curvature kappa and length t has its steepest slope 1.5 kappa/t halfway.
+    Transitions without a length get the one that the steering rate needs at the turn's speed: a
+    Bloss ramp of curvature kappa and length t has its steepest slope 1.5 kappa/t halfway.
 
     Raises
     ------
     ValueError
-        If the turns alone are longer than the length asked for, or there is nothing to scale.
+        If the turns alone are longer than `length`, or there is nothing to scale.
     """
     turning = sum(abs(segment.turn) for segment in segments)
     if total_turning is not None and turning == 0.0:
@@ -151,24 +172,24 @@ def fit(
 
 
 def grid(length: float, spacing: float = SPACING) -> Array:
-    """Uniform arc length from 0 to `length`, as near to `spacing` as fits."""
+    """Uniform arc lengths from 0 to `length`, with a spacing as near to `spacing` as fits."""
     return np.linspace(0.0, length, max(round(length / spacing), 3) + 1)
 
 
 def build(segments: Sequence[Segment]) -> Geometry:
-    """Geometry of fitted segments (every turn with its length and transition), from the origin.
+    """Compute the geometry of segments from `fit`, starting at the origin along x.
 
     Raises
     ------
     ValueError
-        Naming a segment without a length: a turn that did not go through `fit`.
+        If a segment has no length, as turns have none before `fit`.
     """
     for position, segment in enumerate(segments, start=1):
         if segment.length <= 0.0:
             raise ValueError(f"segment {position} has no length: turns get theirs from fit()")
     if not segments:
         raise ValueError("no segments")
-    # Pieces of curvature: start, length, curvature at both ends, heading at the start.
+    # Pieces of curvature: start, length, curvature at both ends, heading at the start, share.
     pieces: list[tuple[float, float, float, float, float, float]] = []
     start = heading = 0.0
     for segment in segments:
@@ -205,7 +226,7 @@ def build(segments: Sequence[Segment]) -> Geometry:
 
 
 def integrate(heading: Callable[[Array], Array], s: Array) -> tuple[Array, Array]:
-    """Positions (n,) on a grid s (n,) from a heading function, starting at the origin."""
+    """Integrate a heading function to positions x, y on a grid s, each (n,), from the origin."""
     steps = np.diff(s)
     inner = heading((s[:-1, None] + steps[:, None] * _NODES).ravel()).reshape(-1, len(_NODES))
     x = np.concatenate([[0.0], np.cumsum((np.cos(inner) @ _WEIGHTS) * steps)])
@@ -219,10 +240,10 @@ def parametric(
     *,
     pieces: int = 20_000,
 ) -> Geometry:
-    """Geometry of a smooth curve over its parameter t in [0, end].
+    """Compute the geometry of a smooth curve over its parameter t in [0, end].
 
     `curve(t)` returns x, y and their first and second derivatives. Arc length is a Gauss-Legendre
-    quadrature of |r'|, inverted by Newton's method; heading and curvature are the analytic ones.
+    quadrature of |r'|, inverted by Newton's method; heading and curvature are analytic.
     """
     knots = np.linspace(0.0, end, pieces + 1)
     steps = np.diff(knots)
@@ -248,10 +269,9 @@ def parametric(
 
 
 def polyline(kinks: Sequence[float], lengths: ArrayLike) -> tuple[Array, Array]:
-    """Waypoints on straight legs joined by kinks (rad), legs given in whole steps of a grid.
+    """Compute waypoints x, y, one unit apart, on straight legs joined by kinks (rad).
 
-    `lengths` has one leg more than `kinks`; each leg must be a multiple of the step it was counted
-    in, so waypoints are the cumulative sum of unit steps.
+    `lengths` are the legs' numbers of steps, one leg more than `kinks`.
     """
     headings = np.concatenate([[0.0], np.cumsum(kinks)])
     counts = np.asarray(lengths, dtype=int)
@@ -259,3 +279,107 @@ def polyline(kinks: Sequence[float], lengths: ArrayLike) -> tuple[Array, Array]:
     x = np.concatenate([[0.0], np.cumsum(np.cos(steps))])
     y = np.concatenate([[0.0], np.cumsum(np.sin(steps))])
     return x, y
+
+
+class Smoothed(NamedTuple):
+    """A curve's geometry, and its distances from the points that it was fitted to, m."""
+
+    geometry: Geometry
+    max_deviation: float
+    rms_deviation: float
+
+
+def smooth(points: Array, tolerance: float, *, closed: bool = False) -> Smoothed:
+    """Fit the smoothest quintic spline whose rms deviation from the points is at most `tolerance`.
+
+    Parameters
+    ----------
+    points
+        (n, 2), m; a closed curve's first point is not repeated at the end.
+    tolerance
+        m; 0 interpolates with a cubic spline.
+    closed
+        Whether the curve goes on from the last point to the first.
+    """
+    chain = np.vstack([points, points[:1]]) if closed else points
+    at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(chain, axis=0).T))])
+    if tolerance > 0.0:
+        spline = _penalised(points, at, tolerance, closed)
+    else:
+        spline = make_interp_spline(at, chain, k=3, bc_type="periodic" if closed else None)
+    deviation = np.hypot(*(spline(at) - chain).T)
+    geometry = parametric(_curve(spline), float(at[-1]))
+    return Smoothed(geometry, float(deviation.max()), float(np.sqrt(np.mean(deviation**2))))
+
+
+def _curve(spline: BSpline) -> Callable[[Array], Derivatives]:
+    """Return the coordinates and their derivatives as a function for `parametric`."""
+    first, second = spline.derivative(), spline.derivative(2)
+
+    def curve(t: Array) -> Derivatives:
+        r, dr, ddr = spline(t).T, first(t).T, second(t).T
+        return r[0], r[1], dr[0], dr[1], ddr[0], ddr[1]
+
+    return curve
+
+
+def _penalised(points: Array, at: Array, tolerance: float, closed: bool) -> BSpline:
+    """Minimise |B c - points|^2 + penalty |D c|^2 over control points c, D third differences.
+
+    The rms deviation grows with the penalty; take the largest penalty that keeps `tolerance`.
+    """
+    length = float(at[-1])
+    cells = int(np.ceil(length / max(float(np.median(np.diff(at))), LEAST_KNOT_SPACING)))
+    cells = max(cells, DEGREE + 3)
+    knots = length / cells * np.arange(-DEGREE, cells + DEGREE + 1)
+    within = np.minimum(at[: len(points)], length * (1.0 - 1e-15))
+    basis = BSpline.design_matrix(within, knots, DEGREE)
+    unknowns = cells if closed else cells + DEGREE
+    difference = sparse.identity(unknowns, format="csr")
+    if closed:  # control points repeat after `cells`
+        whole = sparse.identity(cells, format="csr")
+        basis = basis @ sparse.vstack([whole, whole[:DEGREE]])
+        shift = whole[np.r_[1:cells, 0]] - whole
+        difference = shift @ shift @ shift
+    else:
+        for _ in range(3):
+            difference = difference[1:] - difference[:-1]
+    normal, roughness = (basis.T @ basis).tocsc(), (difference.T @ difference).tocsc()
+    centre = points.mean(axis=0)
+    right = basis.T @ (points - centre)
+
+    def solve(exponent: float) -> tuple[Array, float]:
+        control = splu((normal + 10.0**exponent * roughness).tocsc()).solve(right)
+        residual = basis @ control - (points - centre)
+        return control, float(np.sqrt(np.mean((residual**2).sum(axis=1))))
+
+    low, high = PENALTY_EXPONENTS
+    if solve(high)[1] <= tolerance:
+        low = high
+    while high - low > PENALTY_RESOLUTION:
+        middle = 0.5 * (low + high)
+        if solve(middle)[1] <= tolerance:
+            low = middle
+        else:
+            high = middle
+    control = solve(low)[0] + centre
+    if closed:
+        control = np.vstack([control, control[:DEGREE]])
+    return BSpline(knots, control, DEGREE)
+
+
+def from_geometry(
+    geometry: Geometry,
+    limits: SpeedLimits,
+    name: str,
+    *,
+    closed: bool = False,
+    **metadata: object,
+) -> ReferencePath:
+    """Make a path from a geometry and the jerk-limited speed profile that the limits allow."""
+    spacing = float(geometry.arc_length[1])
+    speed = plan_speed(geometry.curvature, spacing, limits, closed=closed, share=geometry.share)
+    return ReferencePath(
+        *geometry[:5], speed=speed, name=name, closed=closed,
+        metadata={"limits": asdict(limits), **metadata},
+    )  # fmt: skip

@@ -1,10 +1,10 @@
 """Jerk-limited speed profile along a path of given curvature, by sequential linear programming.
 
 With b = v^2 over arc length, acceleration is a = b'/2 and jerk is v a'. Maximising speed under caps
-from lateral acceleration, steering rate and top speed is then linear in b but for the jerk bound
-|a'| <= j b^(-1/2), convex in b on the right: linearised about the last profile it is tightened, so
-every iterate is feasible (Lipp and Boyd, Minimum-time speed optimisation over a fixed path, 2014,
-for the variable b; the jerk bound's linearisation is this project's).
+from lateral acceleration, steering rate and top speed is then linear in b, except for the jerk
+bound |a'| <= j b^(-1/2). Its right side is convex in b, so linearising it about the last profile
+tightens it, and every iterate is feasible (Lipp and Boyd, Minimum-time speed optimisation over a
+fixed path, 2014, for the variable b; the linearisation of the jerk bound is this project's).
 """
 
 from dataclasses import dataclass
@@ -19,29 +19,32 @@ from trajectories.path import ReferencePath
 Array = NDArray[np.float64]
 
 GRID = 1.0
-"""m, largest spacing of the linear programmes' grid."""
+"""Largest spacing of the linear programmes' grid, m."""
 ITERATIONS = 6
+"""Largest number of linear programmes."""
 STEERING_MARGIN = 0.96
 """Share of the steering rate that is used."""
 JERK_MARGIN = 0.92
-"""Share of the jerk that is used: where speed is low the grid overshoots by up to 8 %."""
+"""Share of the jerk that is used: at low speed the grid overshoots by up to 8 %."""
 SEAM = 1e-6
-"""m/s by which the speeds at a lap's ends may differ: a jerk of some mm/s^3."""
+"""Largest difference of the speeds at a lap's ends, m/s: a jerk of some mm/s^3."""
 MORE_LAPS = 4
+"""Attempts with one more lap at either end until the ends of the middle one meet."""
 CHATTER_WEIGHT = 2e-3
-"""Weight of the L1 term on changes of acceleration; without it profiles chatter at the caps."""
+"""Weight of the L1 penalty on changes of acceleration; without it profiles chatter at the caps."""
 
 
 @dataclass(frozen=True)
 class SpeedLimits:
-    """What the speed profile keeps.
+    """Limits of a speed profile.
 
     Parameters
     ----------
     max_speed
         m/s.
     max_lateral_acceleration, max_acceleration, max_deceleration
-        m/s^2; the deceleration stays below the acceleration, as the paper's tables give one row.
+        m/s^2; the deceleration is by default 95 % of the acceleration, since the paper's tables
+        have one row for both.
     max_jerk
         m/s^3.
     max_steering_rate
@@ -51,8 +54,8 @@ class SpeedLimits:
     end_speed
         m/s at both ends of an open path.
     min_speed
-        m/s to which caps are raised where they are lower: the least speed of the paper's
-        constraint table, so that a kink slows the reference down but never stops it.
+        m/s; lower caps are raised to it, so that a kink slows the reference down but never stops
+        it. The default is the lowest speed in the paper's constraint table.
     """
 
     max_speed: float
@@ -67,7 +70,7 @@ class SpeedLimits:
 
     @property
     def deceleration(self) -> float:
-        """Bound on deceleration, m/s^2: 95 % of the acceleration's unless given."""
+        """Bound on deceleration, m/s^2: 95 % of `max_acceleration` unless given."""
         if self.max_deceleration is None:
             return 0.95 * self.max_acceleration
         return self.max_deceleration
@@ -76,9 +79,9 @@ class SpeedLimits:
 def speed_caps(
     curvature: Array, spacing: float, limits: SpeedLimits, share: Array | float = 1.0
 ) -> Array:
-    """Pointwise bound on speed (n,), m/s: top speed, lateral acceleration, steering rate.
+    """Pointwise bound on speed (n,), m/s, by top speed, lateral acceleration and steering rate.
 
-    `share` (n,) or a scalar scales the lateral acceleration that may be used at a point.
+    `share`, (n,) or a scalar, scales the lateral acceleration that may be used at a point.
     """
     bent = np.maximum(np.abs(curvature), 1e-9)
     lateral = np.sqrt(share * limits.max_lateral_acceleration / bent)
@@ -97,15 +100,15 @@ def plan_speed(
     closed: bool = False,
     share: Array | float = 1.0,
 ) -> Array:
-    """Fastest jerk-limited speed profile (n,), m/s, on the grid of `curvature` (n,), 1/m.
+    """Plan the fastest jerk-limited speed profile (n,), m/s, for a `curvature` (n,), 1/m.
 
-    An open path starts and ends at `limits.end_speed`; a closed one is planned over three laps, or
-    as many as reaching full speed takes, of which the middle one is kept, so its ends meet.
+    An open path starts and ends at `limits.end_speed`. A closed path is planned over three laps, or
+    over more if it takes them to reach full speed, and the middle lap is kept, so its ends meet.
 
     Raises
     ------
     RuntimeError
-        If the linear programme finds no profile (the message holds the solver's).
+        If the linear programme finds no profile; the message contains the solver's.
     """
     if closed:
         lap, n = spacing * (len(curvature) - 1), len(curvature) - 1
@@ -115,7 +118,7 @@ def plan_speed(
         )
         before = max(int(np.ceil(run_up / lap)), 1)
         shares = np.broadcast_to(share, curvature.shape)
-        # A stop is felt from further off where jerk is bound: then from more laps away.
+        # The jerk bound lets a stop affect speeds far away: add laps until the ends meet.
         for around in range(before, before + MORE_LAPS):
             laps = np.append(np.tile(curvature[:-1], 2 * around + 1), curvature[-1])
             shared = np.append(np.tile(shares[:-1], 2 * around + 1), shares[-1])
@@ -130,7 +133,7 @@ def plan_speed(
     cells = max(int(np.ceil(length / GRID)), 8)
     coarse = np.linspace(0.0, length, cells + 1)
     fine = np.linspace(0.0, length, len(curvature))
-    # A coarse node takes the least cap of its neighbourhood, so that no cap slips between nodes.
+    # A coarse node takes the lowest cap around it, so that no cap is lost between nodes.
     reach = int(np.ceil(0.5 * length / cells / spacing))
     nodes = np.rint(coarse / spacing).astype(int).clip(0, len(caps) - 1)
     padded = np.pad(caps, reach, mode="edge")
@@ -142,10 +145,10 @@ def plan_speed(
 
 
 def _smooth(values: Array, at: Array) -> Array:
-    """Uniform quadratic B-spline with control points `values` (m,) at indices `at` (n,).
+    """Evaluate the uniform quadratic B-spline with control points `values` (m,) at indices (n,).
 
-    Its slope, the acceleration, is continuous and linear between the midpoints of cells, where the
-    linear programme's is a staircase; it stays within the control points' convex hull.
+    Its slope, the acceleration, is continuous and linear between the midpoints of cells, whereas
+    the linear programme's is a staircase; it stays within the control points' convex hull.
     """
     padded = np.concatenate([[2 * values[0] - values[1]], values, [2 * values[-1] - values[-2]]])
     node = np.rint(at).astype(int).clip(0, len(values) - 1)
@@ -158,7 +161,7 @@ def _smooth(values: Array, at: Array) -> Array:
 
 
 def _plan(caps: Array, h: float, limits: SpeedLimits) -> Array:
-    """Squared speed (m,) on a grid of spacing h under squared caps (m,)."""
+    """Plan the squared speed (m,) on a grid of spacing h under squared caps (m,)."""
     m = len(caps)
     end = min(limits.end_speed**2, float(caps[0]), float(caps[-1]))
     upper = caps.copy()
@@ -188,7 +191,7 @@ def _plan(caps: Array, h: float, limits: SpeedLimits) -> Array:
             ],
             format="csr",
         )
-        # Acceleration begins and ends at zero: the first and last cell are bound by jerk alone.
+        # Acceleration is zero at both ends, so jerk limits it in the first and the last cell.
         standing = allowed * end**-0.5
         faster = np.full(m - 1, limits.max_acceleration)
         faster[0] = min(faster[0], standing)
@@ -217,7 +220,7 @@ def _plan(caps: Array, h: float, limits: SpeedLimits) -> Array:
 
 
 def _without_jerk(caps: Array, h: float, limits: SpeedLimits) -> Array:
-    """Forward and backward pass under acceleration bounds alone: the first iterate."""
+    """Compute the first iterate: a forward and a backward pass under acceleration bounds alone."""
     squared = caps.copy()
     for k in range(1, len(squared)):
         squared[k] = min(squared[k], squared[k - 1] + 2 * limits.max_acceleration * h)
@@ -229,10 +232,11 @@ def _without_jerk(caps: Array, h: float, limits: SpeedLimits) -> Array:
 def constant_speed(path: ReferencePath) -> float:
     """Highest constant speed (m/s) that a path's own limits allow all along it.
 
-    Never below the limits' end speed, so that kinked waypoints are driven at walking pace.
+    Never below the limits' end speed, so that kinked waypoints are driven at walking pace. A path
+    without limits in its metadata is driven at its lowest speed.
     """
-    limits = SpeedLimits(**path.metadata["limits"]) if "limits" in path.metadata else None
-    if limits is None:
+    if "limits" not in path.metadata:
         return float(path.speed.min())
+    limits = SpeedLimits(**path.metadata["limits"])
     caps = speed_caps(path.curvature, path.spacing, limits)
     return max(float(caps.min()), limits.end_speed)

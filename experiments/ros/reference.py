@@ -17,11 +17,9 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 
 from experiments.ros.read import BagError, Reading, info, read
 from experiments.ros.topics import Datum, Fixes, Odometry
-from trajectories.catalog import from_geometry
 from trajectories.importers import IMPORT_LIMITS, MAX_STEERING_ANGLE, self_approach
 from trajectories.path import ReferencePath
-from trajectories.shapes import Geometry
-from trajectories.smoothing import smooth
+from trajectories.shapes import Geometry, from_geometry, smooth
 from trajectories.speed import SpeedLimits
 
 Array = NDArray[np.float64]

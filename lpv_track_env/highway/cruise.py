@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trajectories import ReferencePath
-from trajectories.interpolation import SPEED, TIME
+from trajectories.table import SPEED, TIME
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,7 @@ from highway_env.road.road import RoadNetwork
 from numpy.typing import NDArray
 
 from trajectories import ReferencePath
-from trajectories.catalog import from_geometry
-from trajectories.smoothing import smooth
+from trajectories.shapes import from_geometry, smooth
 from trajectories.speed import SpeedLimits
 
 Array = NDArray[np.float64]

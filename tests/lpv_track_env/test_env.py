@@ -26,7 +26,7 @@ from lpv_track_env.registration import PATH_TRACKING
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES
 from trajectories import shapes
-from trajectories.catalog import SHAPE_LIMITS, from_geometry
+from trajectories.catalog import SHAPE_LIMITS
 
 Array = NDArray[Any]
 Step = tuple[Array, float, bool, bool, dict[str, Any]]
@@ -575,7 +575,7 @@ def test_figure_eight_stays_on_the_local_branch() -> None:
 def test_vehicle_that_cannot_take_the_bend_fails_cleanly() -> None:
     """A bend of 5 m radius; at pi/6 the course's car turns on no less than about 9 m."""
     geometry = shapes.build(shapes.fit(shapes.parse("S 30 | L 180 r5 | S 30"), SHAPE_LIMITS))
-    path = from_geometry(geometry, SHAPE_LIMITS, "tight")
+    path = shapes.from_geometry(geometry, SHAPE_LIMITS, "tight")
     assert COURSE_CAR.wheelbase * np.abs(path.curvature).max() > math.tan(math.pi / 6)
     env = make(trajectory=path, vehicle="course-car", max_lateral_error=2.0)
     steps = episode(env)

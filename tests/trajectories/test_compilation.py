@@ -15,6 +15,7 @@ import pytest
 from numba.core import event
 from numba.core.types.functions import BaseFunction
 
+import lpv_track_env  # noqa: F401  its sources count once it is loaded
 from trajectories import compilation
 from trajectories.compilation import compiled, entry_point, source_digest
 
@@ -77,7 +78,7 @@ def python_is_nan(x: float) -> bool:
 
 
 HERE = Path(compilation.__file__).parent
-DIGEST = source_digest(HERE, HERE.parent / "lpv_track_env", Path(__file__).parent)
+DIGEST = source_digest(HERE, HERE.parent / "lpv_track_env", Path(__file__).parents[1])
 compiled_sum, compiled_quotient = compiled(python_sum), compiled(python_quotient)
 compiled_is_nan = compiled(python_is_nan)
 
@@ -211,7 +212,7 @@ def test_function_that_numba_cannot_cache_warns_and_works() -> None:
 )
 def test_without_a_writable_cache_it_warns_and_works(tmp_path: Path) -> None:
     """Permissions do not stop root, so numba is left with one folder that cannot exist."""
-    code = "import trajectories.interpolation as p\nprint(*p.cell(2.5, 4.0, False, 5))\n"
+    code = "import trajectories.table as p\nprint(*p.cell(2.5, 4.0, False, 5))\n"
     result = run(
         code, tmp_path, NUMBA_CACHE_LOCATOR_CLASSES="UserProvidedCacheLocator",
         NUMBA_CACHE_DIR="/dev/null/nowhere",

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import minimize_scalar
 
-from trajectories import ReferencePath, interpolation, load, projection
+from trajectories import ReferencePath, load, projection, table
 
 NAMES = ("T1", "T4", "T2-raw", "circle", "figure-eight", "sine", "u-turn", "random-7")
 
@@ -102,7 +102,7 @@ def test_foot_point_is_the_nearest_point(name: str) -> None:
         y = float(at.y + lateral * np.cos(at.heading))
 
         def distance(t: float, x: float = x, y: float = y) -> float:
-            px, py = interpolation.position_at(path.table, path.length, path.closed, t)
+            px, py = table.position_at(path.table, path.length, path.closed, t)
             return math.hypot(x - px, y - py)
 
         best = minimize_scalar(distance, bounds=(s - 0.5, s + 0.5), method="bounded",

@@ -19,7 +19,7 @@ from highway_env.vehicle.kinematics import Vehicle
 import trajectories
 from lpv_track_env.highway import traffic
 from lpv_track_env.highway.cruise import STANDSTILL, CruiseControl, Leader, lower_speed
-from trajectories.interpolation import SPEED, TIME
+from trajectories.table import SPEED, TIME
 
 CRUISE = CruiseControl()
 FRONT, HALF_WIDTH = 2.5, 1.0
