@@ -16,12 +16,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> int:
     """Rebuild `report.html`, print the tables, and return 0."""
     from experiments.report.build import where, write_report
-    from experiments.run.console_tables import console_table
+    from experiments.run.console_tables import all_tables
     from experiments.run.store import ResultStore
 
     if not options.folder.is_dir():
         raise ValueError(f"{options.folder} is not a folder of results")
     report = write_report(options.folder)
-    console.print(console_table(ResultStore(options.folder).cases()))
+    console.print(all_tables(ResultStore(options.folder).cases()))
     console.print(where(report), markup=False, highlight=False, soft_wrap=True)
     return 0

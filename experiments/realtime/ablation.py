@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.figures import COLOURS, plain_ticks, save_figure
-from experiments.run.benchmark import run_benchmark, selected, tell_failed
+from experiments.run.benchmark import print_failed, run_benchmark, selected
 from experiments.run.provenance import revision, versions
 from experiments.run.suites import grid
 from experiments.run.tables import estimate
@@ -95,7 +95,7 @@ def ablate(
         "seeds": list(seeds),
     }  # fmt: skip
     store = run_benchmark(specs, folder, workers=workers, settings=settings, console=console)
-    if tell_failed(selected(store, specs), console):
+    if print_failed(selected(store, specs), console):
         # A table of what is left would compare unlike things; the same command tries them again.
         return 1
     rows = [

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.figures import COLOURS, plain_ticks, save_figure
-from experiments.run.benchmark import run_benchmark, selected, tell_failed
+from experiments.run.benchmark import print_failed, run_benchmark, selected
 from experiments.run.case import Case
 from experiments.run.computing import ARRANGEMENTS, ComputingTimes, quantiles
 from experiments.run.provenance import revision, versions
@@ -154,7 +154,7 @@ def compare(
         "period": PERIOD,
     }  # fmt: skip
     store = run_benchmark(specs, folder, workers=workers, settings=settings, console=console)
-    if tell_failed(selected(store, specs), console):
+    if print_failed(selected(store, specs), console):
         # A table of what is left would compare unlike things; the same command tries them again.
         return 1
     rows = [

@@ -18,9 +18,9 @@ from experiments.report.page import (
 )
 from experiments.report.tracking import condition_styles
 from experiments.run import published, tables
-from experiments.run.band_metrics import BANDS
-from experiments.run.curvature_table import NOTE, Line, band_lines, band_ranges
-from experiments.run.tables import EFFORT, FURTHER, TRACKING, Column, Estimate, Row
+from experiments.run.agent_tables import BAND_NOTE, Line, band_lines, band_ranges
+from experiments.run.metrics import BANDS
+from experiments.run.tables import EFFORT, FURTHER, TRACKING, Column, Estimate, Row, Setting
 
 ERRORS = (
     ("ale", "ALE (m)", "Average lateral error"),
@@ -149,7 +149,7 @@ def _ends(value: Estimate) -> tuple[float, float]:
     return value.mean - width, value.mean + width
 
 
-def _tables(document: Document, setting: str, rows: Sequence[Row]) -> str:
+def _tables(document: Document, setting: Setting, rows: Sequence[Row]) -> str:
     """Return the paper's table, with effort, constraints and further columns folded away."""
     ours = [row for row in rows if not row.published]
     texts: dict[str, Callable[[Row], str]] = {"end": lambda row: row.end}
@@ -202,10 +202,10 @@ def html_rows(
         label = html.escape(row.label + (f" ×{row.runs}" if row.runs > 1 else ""))
         mark = f' class="{classes}"' if classes else ""
         lines.append(
-            f'<tr{mark}><td class="path">{html.escape(row.trajectory)}</td>'
+            f'<tr{mark}><td class="path">{html.escape(tables.path_name(row.trajectory))}</td>'
             f'<th class="who" scope="row">{label}</th>{cells}</tr>'
         )
-    longest = max((len(row.trajectory) for row in rows), default=4)
+    longest = max((len(tables.path_name(row.trajectory)) for row in rows), default=4)
     body = "\n".join(lines)
     return (
         f'<table class="grouped" style="--path: {min(max(longest, 4), 9)}ch"><thead><tr>'
@@ -236,18 +236,18 @@ def curvature_section(document: Document, cases: Sequence[Result], styles: Style
         figure = document.figure(
             "ALE by the path's curvature. Mean with its 95 % interval over seeds where there are "
             "several; hollow marks are those whose lines are dashed elsewhere.",
-            by_band(own, styles),
+            by_band({str(setting): found for setting, found in own.items()}, styles),
             legend(styles, [label for found in own.values() for label, _ in found]),
             wide=True,
         )
 
-    def table(setting: str, _: Sequence[Result]) -> str:
+    def table(setting: Setting, _: Sequence[Result]) -> str:
         if setting not in lines:
             return ""
         caption = f"ALE (m) by the path's curvature, {setting}."
         return document.table(caption, _band_table(lines[setting]))
 
-    return joined([paragraph(NOTE), figure, per_setting(cases, table)])
+    return joined([paragraph(BAND_NOTE), figure, per_setting(cases, table)])
 
 
 def by_band(lines: Mapping[str, Sequence[Line]], styles: Styles) -> list[Panel]:

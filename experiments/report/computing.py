@@ -18,8 +18,8 @@ from experiments.report.page import (
     legend,
     paragraph,
 )
-from experiments.run.learning_table import trainings
-from experiments.run.learning_words import UNKNOWN, duration
+from experiments.run.learning_cost import UNKNOWN, duration
+from experiments.run.tables import trainings
 
 Array = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ def computing_section(document: Document, drives: Sequence[Drive], styles: Style
     own = [setting for setting, (group, _) in groups.items() if family_of(group[0].case) == family]
     drawn = own or list(groups)[:1]
     panels = [
-        Panel(setting, _exceedance(groups[setting][1], styles, _period(groups[setting][0])))
+        Panel(str(setting), _exceedance(groups[setting][1], styles, _period(groups[setting][0])))
         for setting in drawn
     ]
     shown = {label for setting in drawn for label in groups[setting][1]}

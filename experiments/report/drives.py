@@ -1,9 +1,9 @@
 """Drives that a report draws: cases with their traces, grouped by setting and by conditions."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ import trajectories
 from experiments.report.page import first_open
 from experiments.run import tables
 from experiments.run.store import ResultStore
+from experiments.run.tables import Setting
 from lpv_track_env import vehicle
 from lpv_track_env.bicycle import PSI, X, Y
 from lpv_track_env.vehicle import VehicleParameters
@@ -19,6 +20,7 @@ from trajectories import ReferencePath
 
 Array = NDArray[np.float64]
 Result = Mapping[str, Any]
+Key = TypeVar("Key", bound=Hashable)
 
 TRACE = (
     "time", "state", "arc_length", "lateral_error", "heading_error", "reference_speed",
@@ -88,7 +90,7 @@ def usable(trace: Mapping[str, Array] | None) -> bool:
 
 def drives_of(cases: Iterable[Result], store: ResultStore) -> tuple[list[Drive], list[Result]]:
     """Return the first seed's drive of every agent, setting and path, and cases without a trace."""
-    drives: dict[tuple[str, str, str], Drive] = {}
+    drives: dict[tuple[Setting, str, str], Drive] = {}
     missing: list[Result] = []
     for case in cases:
         label, path = tables.label_of(case), str(case.get("trajectory"))
@@ -103,9 +105,9 @@ def drives_of(cases: Iterable[Result], store: ResultStore) -> tuple[list[Drive],
     return list(drives.values()), missing
 
 
-def family_of(case: Result) -> str:
-    """Return the setting of a case without its conditions, in words."""
-    return tables.setting_of({**case, "conditions": "simulation"})
+def family_of(case: Result) -> Setting:
+    """Return the family of a case's setting, which is all of it but the conditions."""
+    return tables.setting_of(case).family
 
 
 def in_families(cases: Sequence[Result]) -> list[Result]:
@@ -114,12 +116,14 @@ def in_families(cases: Sequence[Result]) -> list[Result]:
     return sorted(cases, key=lambda case: places[family_of(case)])
 
 
-def main_family(cases: Iterable[Result]) -> str:
+def main_family(cases: Iterable[Result]) -> Setting:
     """Return the first family, whose figures and tables are not folded away."""
     return family_of(next(iter(cases)))
 
 
-def per_setting(cases: Sequence[Result], content: Callable[[str, Sequence[Result]], str]) -> str:
+def per_setting(
+    cases: Sequence[Result], content: Callable[[Setting, Sequence[Result]], str]
+) -> str:
     """Join content(setting, its cases): the main family's shown, other settings folded away."""
     family = main_family(cases)
     parts = [
@@ -132,10 +136,10 @@ def per_setting(cases: Sequence[Result], content: Callable[[str, Sequence[Result
 def families(drives: Iterable[Drive]) -> list[Family]:
     """Group drives by family, in order."""
     groups = _grouped(drives, lambda drive: family_of(drive.case))
-    return [Family(name, group) for name, group in groups.items()]
+    return [Family(str(family), group) for family, group in groups.items()]
 
 
-def by_setting(drives: Iterable[Drive]) -> dict[str, list[Drive]]:
+def by_setting(drives: Iterable[Drive]) -> dict[Setting, list[Drive]]:
     """Group drives by setting, in order."""
     return _grouped(drives, lambda drive: tables.setting_of(drive.case))
 
@@ -145,8 +149,8 @@ def by_trajectory(drives: Iterable[Drive]) -> dict[str, list[Drive]]:
     return _grouped(drives, lambda drive: drive.trajectory)
 
 
-def _grouped(drives: Iterable[Drive], key: Callable[[Drive], str]) -> dict[str, list[Drive]]:
-    groups: dict[str, list[Drive]] = {}
+def _grouped(drives: Iterable[Drive], key: Callable[[Drive], Key]) -> dict[Key, list[Drive]]:
+    groups: dict[Key, list[Drive]] = {}
     for drive in drives:
         groups.setdefault(key(drive), []).append(drive)
     return groups

@@ -71,7 +71,7 @@ def moments(drive: Drive) -> dict[str, Any]:
         "agent": drive.label,
         "conditions": drive.conditions,
         "seed": case.get("seed"),
-        "family": family_of(case),
+        "family": str(family_of(case)),
         "end": str(case.get("end") or "?").replace("_", " "),
         "duration": float(time[-1] - time[0]),
         "count": count,
@@ -126,11 +126,12 @@ def replay_section(drives: Sequence[Drive]) -> str:
     left = [setting for setting in by_setting(drives) if setting not in groups]
     rule = (
         f"{len(kept)} drives are embedded: every agent's first seed on every path, setting by "
-        f"setting up to {BUDGET / 1e6:g} MB ({'; '.join(groups)}). A drive is thinned to at most "
-        f"{SAMPLES} samples, quantities to 16 bits; the results folder has the exact values."
+        f"setting up to {BUDGET / 1e6:g} MB ({'; '.join(map(str, groups))}). A drive is thinned to "
+        f"at most {SAMPLES} samples, quantities to 16 bits; the results folder has the exact "
+        "values."
     )
     if left:
-        rule += f" Not embedded: {'; '.join(left)}."
+        rule += f" Not embedded: {'; '.join(map(str, left))}."
     return joined(
         [
             paragraph(

@@ -141,7 +141,7 @@ def _reached(cases: Iterable[Result], drives: Mapping[Any, Drive]) -> str:
             [
                 tables.label_of(case),
                 str(case.get("trajectory")),
-                tables.setting_of(case),
+                str(tables.setting_of(case)),
                 str(case.get("seed")),
                 f"{metrics.get('excess_lateral_velocity', 0.0):.3f}",
                 f"{100 * metrics.get('violated_lateral_velocity', 0.0):.1f}",

@@ -2,21 +2,23 @@
 
 import html
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from experiments.report.drives import LEAD, family_of, main_family, per_setting
 from experiments.report.page import Document, html_table, joined, paragraph
-from experiments.run import published, tables
+from experiments.run import tables
+from experiments.run.agent_tables import (
+    KEY_FIGURES,
+    against_published,
+    key_lines,
+    over_seeds,
+    with_interval,
+)
 from experiments.run.statistics import rate_interval
-from experiments.run.tables import Estimate, Result, estimate
+from experiments.run.tables import Result
 
-KEY_HEADINGS = (
-    "agent", "whole path", "mean ALE, m", "worst MLE, m", "mean AOE, rad",
-    "ALE against published", "median predict, ms", "worst p99, ms", "all constraints kept",
-)  # fmt: skip
 KEY_NOTE = (
     "ALE, AOE: root mean square lateral and heading error, MLE: largest lateral error; over all "
     "runs that did not fail, with the 95 % interval over seeds where there are several. An episode "
@@ -65,7 +67,7 @@ def summary_section(document: Document, cases: Sequence[Result], superseded: int
             cases,
             lambda setting, group: document.table(
                 f"Key figures of every agent, {setting}.",
-                html_table(KEY_HEADINGS, _key_lines(group), range(1, len(KEY_HEADINGS))),
+                html_table(KEY_FIGURES, key_lines(group), range(1, len(KEY_FIGURES))),
             ),
         )
     )
@@ -98,12 +100,12 @@ def findings(cases: Sequence[Result]) -> list[Tile]:
         by_conditions.setdefault(words, []).append(case)
     shown: list[Tile] = []
     for conditions, group in by_conditions.items():
-        remark = _against_published(group)
+        remark = against_published(group)
         worst = max(group, key=lambda case: case["metrics"]["mle"])
         shown += [
             (
                 f"{lead}: ALE, {conditions}",
-                f"{_words(over_seeds(group, 'ale'))} m",
+                f"{with_interval(over_seeds(group, 'ale'))} m",
                 f"{remark} of the published" if remark != "–" else "",
             ),
             (
@@ -163,69 +165,6 @@ def _done(cases: Iterable[Result]) -> list[Result]:
     return [case for case in cases if case.get("status") == "ok"]
 
 
-def over_seeds(cases: Iterable[Result], key: str) -> Estimate:
-    """Return the mean over seeds of the mean over a seed's drives, with its interval.
-
-    Drives of one seed share their disturbances whatever the path.
-    """
-    by_seed: dict[Any, list[float]] = {}
-    for case in cases:
-        by_seed.setdefault(case.get("seed"), []).append(float(case["metrics"][key]))
-    return estimate([sum(values) / len(values) for values in by_seed.values()])
-
-
-def _words(value: Estimate) -> str:
-    width = value.half_width
-    return f"{value.mean:.3f}" if width is None else f"{value.mean:.3f} ±{width:.3f}"
-
-
-def _by_label(cases: Sequence[Result]) -> dict[str, list[Result]]:
-    """Group cases by their agent's label, in the order of the tables."""
-    return {
-        label: [case for case in cases if tables.label_of(case) == label]
-        for label in tables.labels(cases)
-    }
-
-
-def _key_lines(cases: Sequence[Result]) -> list[list[str]]:
-    lines = []
-    for label, group in _by_label(cases).items():
-        done = _done(group)
-        finished = sum(case.get("end") == "finished" for case in group)
-        line = [label, f"{finished} of {len(group)}"]
-        if not done:
-            lines.append([*line, *["–"] * (len(KEY_HEADINGS) - len(line))])
-            continue
-        metrics: list[Mapping[str, float]] = [case["metrics"] for case in done]
-        worst = max(done, key=lambda case: case["metrics"]["mle"])
-        kept = sum(not tables.violated(one) for one in metrics)
-        medians = [case["solver"]["median"] for case in done]
-        lines.append(
-            [
-                *line,
-                _words(over_seeds(done, "ale")),
-                f"{worst['metrics']['mle']:.3f} ({worst.get('trajectory')})",
-                _words(over_seeds(done, "aoe")),
-                _against_published(done),
-                f"{1e3 * np.median(medians):.3f}",
-                f"{1e3 * max(case['solver']['p99'] for case in done):.2f}",
-                f"{kept} of {len(done)}",
-            ]
-        )
-    return lines
-
-
-def _against_published(cases: Iterable[Result]) -> str:
-    shares = [
-        case["metrics"]["ale"] / row["ale"]
-        for case in cases
-        if case.get("trajectory") in published.SIMULATION
-        and (row := published.row(str(case["trajectory"]), case.get("conditions", "simulation")))
-        is not None
-    ]
-    return f"{100 * np.mean(shares):.1f} %" if shares else "–"
-
-
 def failures_section(document: Document, cases: Sequence[Result]) -> str:
     """Return counts with bounds, then each failed case with its error and each warning."""
     ends = per_setting(
@@ -234,7 +173,7 @@ def failures_section(document: Document, cases: Sequence[Result]) -> str:
             f"How drives ended, with the rate of failures and its 95 % interval, {setting}.",
             html_table(
                 END_HEADINGS,
-                [_end_line(label, own) for label, own in _by_label(group).items()],
+                [_end_line(label, own) for label, own in tables.by_label(group).items()],
                 range(1, len(END_HEADINGS)),
             ),
         ),
@@ -242,7 +181,8 @@ def failures_section(document: Document, cases: Sequence[Result]) -> str:
     failed = [
         [
             str(case["id"]), tables.label_of(case), str(case.get("trajectory")),
-            tables.setting_of(case), str(case.get("seed")), str(case.get("error", "no message")),
+            str(tables.setting_of(case)), str(case.get("seed")),
+            str(case.get("error", "no message")),
         ]
         for case in cases
         if case.get("status") != "ok"

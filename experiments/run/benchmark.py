@@ -19,25 +19,29 @@ from rich.progress import (
 from experiments.report.build import where, write_report
 from experiments.run import engines
 from experiments.run.case import Case
-from experiments.run.console_tables import console_table
+from experiments.run.console_tables import screen
 from experiments.run.process import Interrupts
 from experiments.run.store import ResultStore
+from experiments.run.tables import path_name
 
 Spec = Mapping[str, Any]
 
+STEPS = 20
+"""Most lines of progress where the console is no terminal."""
+
 
 def distinct(specs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The same cases, each once."""
+    """Return the specs without repetitions of a case."""
     return list({Case(**spec).id: spec for spec in specs}.values())
 
 
 def check(specs: Sequence[Spec]) -> None:
-    """Refuse unknown names and settings before anything runs.
+    """Check names and settings before anything runs.
 
     Raises
     ------
     ValueError
-        Listing the known names and the nearest.
+        For an unknown one, listing the known ones and the nearest.
     """
     for spec in specs:
         Case(**spec).check()
@@ -52,7 +56,7 @@ def run_benchmark(
     resume: bool = True,
     console: Console,
 ) -> ResultStore:
-    """Run what is not yet in the folder, one fsynced line a case, with a progress bar.
+    """Run the cases that the folder does not hold yet, and store each as it ends.
 
     Raises
     ------
@@ -79,7 +83,7 @@ def run_benchmark(
 
 
 def progress_bar(console: Console) -> Progress:
-    """Bar with counts and times; nothing where the console is no terminal."""
+    """Return a progress bar with counts and times; it shows nothing unless on a terminal."""
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description}"),
@@ -109,11 +113,13 @@ def _run(specs: Sequence[Spec], store: ResultStore, workers: int, console: Conso
             else engines.local_pool(specs, workers, started=started)
         )
         for count, result in enumerate(run, start=1):
-            # First, for a case may have taken it for a failed solve.
+            # Before the result is stored: a case may have taken Ctrl-C for a failed solve.
             interrupts.check()
             store.append(result)
             progress.advance(bar)
-            if not console.is_terminal:
+            # Piped: a line every 5 % of the cases.
+            shares = (STEPS * done // len(specs) for done in (count - 1, count))
+            if not console.is_terminal and len(set(shares)) > 1:
                 elapsed = time.perf_counter() - began
                 console.print(
                     f"[{count}/{len(specs)}, {elapsed:.0f} s] {label(result)}: "
@@ -123,28 +129,32 @@ def _run(specs: Sequence[Spec], store: ResultStore, workers: int, console: Conso
 
 
 def label(spec: Spec) -> str:
-    """Short name of a case for a line of progress."""
-    return f"{spec['agent']} {spec['trajectory']} {spec['vehicle']} {spec['speed_mode']}"
+    """Return a short name of a case for a line of progress."""
+    return f"{spec['agent']} {path_name(spec['trajectory'])} {spec['vehicle']} {spec['speed_mode']}"
 
 
 def selected(store: ResultStore, specs: Sequence[Spec]) -> list[dict[str, Any]]:
-    """Results of some specs, in their order."""
+    """Return the results of some specs, in their order."""
     by_id = {case["id"]: case for case in store.cases()}
     return [by_id[key] for spec in specs if (key := Case(**spec).id) in by_id]
 
 
 def finish(store: ResultStore, specs: Sequence[Spec], console: Console) -> int:
-    """Print the table, write the report, say where; 1 if a case failed, else 0."""
+    """Print tables, write the report, say where the rest is; return 1 if a case failed, else 0."""
     cases = selected(store, specs)
-    console.print(console_table(cases))
+    tables, complete = screen(cases)
+    console.print(tables)
     report = write_report(store.folder)
-    failed = tell_failed(cases, console)
-    console.print(where(report), markup=False, highlight=False, soft_wrap=True)
+    failed = print_failed(cases, console)
+    lines = [where(report)]
+    if not complete:
+        lines.append(f"cases: {store.cases_file}; all tables: lpv-track report {store.folder}")
+    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     return 1 if failed else 0
 
 
-def tell_failed(cases: Sequence[Mapping[str, Any]], console: Console) -> int:
-    """Print a line for each case that failed; how many did."""
+def print_failed(cases: Sequence[Mapping[str, Any]], console: Console) -> int:
+    """Print a line for each case that failed and return their number."""
     failed = [case for case in cases if case["status"] != "ok"]
     for case in failed:
         console.print(f"failed: {label(case)}: {case['error']}", markup=False, style="red")

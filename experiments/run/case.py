@@ -165,7 +165,7 @@ def project_digest() -> str:
     packages = (trajectories, lpv_track_env, agents)
     folders = [Path(str(package.__file__)).parent for package in packages]
     here = Path(__file__).parent
-    names = ("case", "rollout", "metrics", "band_metrics", "computing", "learning_cost")
+    names = ("case", "rollout", "metrics", "computing", "learning_cost")
     own = "".join((here / f"{name}.py").read_text() for name in names)
     return hashlib.sha256((source_digest(*folders) + own).encode()).hexdigest()[:16]
 

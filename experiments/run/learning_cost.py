@@ -1,4 +1,4 @@
-"""What a learned policy cost to make, so that it stands beside what the policy achieves."""
+"""Cost of making a learned policy, which results and tables show beside what it achieves."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,14 +12,15 @@ KINDS: Mapping[str, tuple[type, ...]] = {
     "solves": (int,),
     "command": (str,),
 }
-"""Taken of a policy's `training`: environment steps, wall time (s), NMPC solves, command."""
+"""Entries kept of a policy's `training`: environment steps, wall time (s), NMPC solves, command."""
+UNKNOWN = "not recorded"
 
 
 def of_agent(agent: Agent) -> dict[str, Any]:
-    """`{"training": {...}}` for an agent that runs a learned policy, {} for every other.
+    """Return `{"training": {...}}` for an agent that runs a learned policy, {} for every other.
 
-    It holds `algorithm` and what the policy's `training` has of `KINDS`; an imported policy may
-    have less. Agents without a policy were designed by hand, at a cost that nobody recorded.
+    The entry holds `algorithm` and those of `KINDS` that the policy's `training` has. Agents
+    without a policy were designed by hand, at a cost that nobody recorded.
     """
     policy = getattr(agent, "policy", None)  # delay compensation forwards it
     if not isinstance(policy, Policy):
@@ -30,3 +31,34 @@ def of_agent(agent: Agent) -> dict[str, Any]:
         if type(policy.training.get(key)) in kinds
     }
     return {"training": {"algorithm": policy.algorithm, **known}}
+
+
+def words(training: Mapping[str, Any]) -> str:
+    """Return a summary such as "18.4 M steps, 6 min, 0 solves", without what is not known."""
+    parts = []
+    if "steps" in training:
+        parts.append(f"{count(training['steps'])} steps")
+    if "seconds" in training:
+        parts.append(duration(training["seconds"]))
+    if "solves" in training:
+        parts.append(f"{count(training['solves'])} solves")
+    return ", ".join(parts) or UNKNOWN
+
+
+def count(number: int) -> str:
+    """Write a number with three digits: 980, 12.3 k, 1.21 M."""
+    for size, unit in ((10**6, " M"), (10**3, " k")):
+        if number >= 0.9995 * size:
+            value = number / size
+            decimals = 2 if value < 9.995 else 1 if value < 99.95 else 0
+            return f"{value:.{decimals}f}{unit}"
+    return str(number)
+
+
+def duration(seconds: float) -> str:
+    """Write a time in s below 2 min, in min below 2 h, in h beyond."""
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    if seconds < 7200.0:
+        return f"{seconds / 60.0:.0f} min"
+    return f"{seconds / 3600.0:.1f} h"

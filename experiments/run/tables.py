@@ -1,14 +1,17 @@
-"""The paper's table from results: the rows, which `console_tables` and `html_tables` draw.
+"""Rows of the paper's table from results; `console_tables` and `html_tables` draw them.
 
-Cases are grouped by setting (vehicle, speed mode and whatever else of a case is not the default)
-and trajectory. A group's first row is the published one (kumar2025lpv, simulation), then one row
-per agent; several seeds become a mean and a 95 % interval of it by the t-distribution.
+Cases are grouped by setting (vehicle, speed mode, conditions and so on) and trajectory. A group's
+first row is the published one (kumar2025lpv), then comes one row per agent; several seeds become a
+mean and its 95 % interval by the t-distribution.
 """
 
+import hashlib
+import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import t as student
@@ -17,7 +20,7 @@ import agents
 import trajectories
 from experiments.run import published
 from experiments.run.case import Case
-from experiments.run.learning_words import words
+from experiments.run.learning_cost import words
 
 Result = Mapping[str, Any]
 
@@ -46,6 +49,102 @@ PUBLISHED_NOTE = (
     "Published rows: kumar2025lpv; simulation, and beside other conditions its runs with the "
     "vehicle. Its vehicle, weights and paths are not public: they stand there for orientation."
 )
+
+
+LONGEST, CUT = 80, 48
+"""Most characters of a setting's value in a label, and those that are kept of a longer one."""
+
+
+class Setting(NamedTuple):
+    """Everything that cases of one table share: all of a case but agent, trajectory and seed.
+
+    Mappings are kept as JSON text, so that settings can be compared and be keys. Raw waypoints are
+    a setting of their own: averaged with drivable paths they would say nothing about either.
+    """
+
+    vehicle: str
+    vehicle_changes: str
+    speed_mode: str
+    fixed_speed: float | None
+    raw: bool
+    conditions: str
+    computing: str
+    control_period: float
+    env_settings: str
+
+    @property
+    def family(self) -> "Setting":
+        """The setting under the default conditions: settings that differ only in these share it."""
+        return self._replace(conditions=DEFAULT.conditions)
+
+    @property
+    def departures(self) -> int:
+        """Number of entries that are not the default."""
+        return sum(own != usual for own, usual in zip(self, DEFAULT, strict=True))
+
+    def __str__(self) -> str:
+        """Title of the setting's tables."""
+        parts = [self.vehicle]
+        if changed := json.loads(self.vehicle_changes):
+            parts.append(f"with {_changes(changed)}")
+        speed = "" if self.fixed_speed is None else f" {self.fixed_speed} m/s"
+        parts.append(f"{self.speed_mode} speed{speed}")
+        if self.raw:
+            parts.append("raw waypoints")
+        if self.conditions != DEFAULT.conditions:
+            parts.append(f"conditions {conditions_words(json.loads(self.conditions))}")
+        if computing := json.loads(self.computing):
+            parts.append(f"computing {computing['arrangement']} x {computing.get('load', 1):g}")
+        if self.control_period != DEFAULT.control_period:
+            parts.append(f"control period {self.control_period} s")
+        if changed := json.loads(self.env_settings):
+            parts.append(f"env {_changes(changed)}")
+        return " · ".join(parts)
+
+
+def setting_of(case: Result) -> Setting:
+    """Return the setting of a case; entries that an old result lacks are the default."""
+
+    def text(name: str, default: Any) -> str:
+        return json.dumps(case.get(name) or default, sort_keys=True)
+
+    return Setting(
+        vehicle=str(case.get("vehicle", "?")),
+        vehicle_changes=text("vehicle_changes", {}),
+        speed_mode=str(case.get("speed_mode", "?")),
+        fixed_speed=case.get("fixed_speed"),
+        raw=str(case.get("trajectory")).endswith("-raw"),
+        conditions=text("conditions", Case.conditions),
+        computing=text("computing", {}),
+        control_period=case.get("control_period", Case.control_period),
+        env_settings=text("env_settings", {}),
+    )
+
+
+DEFAULT = setting_of(Case("", "").as_dict())
+
+
+def _changes(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key}={_value_words(values[key])}" for key in sorted(values))
+
+
+def _value_words(value: Any) -> str:
+    """Return a setting's value in a line; a long one is cut, its digest keeping it apart."""
+    if isinstance(value, Mapping):
+        value = " ".join(f"{key}={_value_words(inner)}" for key, inner in value.items())
+    text = str(value)
+    if len(text) <= LONGEST:
+        return text
+    return f"{text[:CUT]}… #{hashlib.sha256(text.encode()).hexdigest()[:6]}"
+
+
+def conditions_words(given: str | Mapping[str, Any]) -> str:
+    """Return the name of conditions and the fields that depart from them."""
+    if isinstance(given, str):
+        return given
+    rest = {key: value for key, value in given.items() if key != "name"}
+    name = str(given.get("name", "ideal"))
+    return f"{name} with {_changes(rest)}" if rest else name
 
 
 @dataclass(frozen=True)
@@ -110,7 +209,7 @@ FURTHER = (
 class Row:
     """One line of the tables: a published row or an agent's runs of one setting and trajectory."""
 
-    setting: str
+    setting: Setting
     trajectory: str
     label: str
     values: Mapping[str, Estimate] = field(default_factory=dict)
@@ -132,60 +231,23 @@ def estimate(values: Sequence[float]) -> Estimate:
     return Estimate(mean, quantile * float(np.std(values, ddof=1)) / n**0.5)
 
 
-def _raw(case: Result) -> bool:
-    return str(case.get("trajectory")).endswith("-raw")
+def path_name(trajectory: object) -> str:
+    """Return the name of a trajectory; of a file, the name without its folder."""
+    return Path(str(trajectory)).name
 
 
-def _departures(case: Result) -> int:
-    """In how many respects a case's setting is not the default one."""
-    names = ("vehicle", "speed_mode", "fixed_speed", "conditions", "control_period")
-    changed = [case.get(name, getattr(Case, name)) != getattr(Case, name) for name in names]
-    extra = (
-        _raw(case), case.get("vehicle_changes"), case.get("env_settings"), case.get("computing"),
-    )  # fmt: skip
-    return sum(map(bool, (*changed, *extra)))
-
-
-def _changes(values: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key}={values[key]}" for key in sorted(values))
-
-
-def setting_of(case: Result) -> str:
-    """Words for all that two cases share if they may stand in one table: all but path and agent.
-
-    Raw waypoints are a setting: averaged with drivable paths they would tell nothing of either.
-    """
-    parts = [str(case.get("vehicle", "?"))]
-    if changed := case.get("vehicle_changes"):
-        parts.append(f"with {_changes(changed)}")
-    speed = f"{case.get('speed_mode', '?')} speed"
-    if case.get("fixed_speed") is not None:
-        speed += f" {case['fixed_speed']} m/s"
-    parts.append(speed)
-    if _raw(case):
-        parts.append("raw waypoints")
-    if (given := case.get("conditions", "simulation")) != "simulation":
-        parts.append(f"conditions {conditions_words(given)}")
-    if given := case.get("computing"):
-        parts.append(f"computing {given['arrangement']} x {given.get('load', 1):g}")
-    if case.get("control_period", Case.control_period) != Case.control_period:
-        parts.append(f"control period {case['control_period']} s")
-    if changed := case.get("env_settings"):
-        parts.append(f"env {_changes(changed)}")
-    return " · ".join(parts)
-
-
-def conditions_words(given: str | Mapping[str, Any]) -> str:
-    """Name of conditions, and what departs from them."""
-    if isinstance(given, str):
-        return given
-    rest = {key: value for key, value in given.items() if key != "name"}
-    name = str(given.get("name", "ideal"))
-    return f"{name} with {_changes(rest)}" if rest else name
+def path_names(trajectories: Iterable[str]) -> dict[str, str]:
+    """Return the names of trajectories; of two files of one name, with their folders'."""
+    found = {trajectory: path_name(trajectory) for trajectory in trajectories}
+    count = Counter(found.values())
+    return {
+        trajectory: name if count[name] == 1 else "/".join(Path(trajectory).parts[-2:])
+        for trajectory, name in found.items()
+    }
 
 
 def label_of(case: Result) -> str:
-    """The agent and, where it has any, its settings."""
+    """Return a case's agent, with its settings if any; this names its rows."""
     settings = case.get("agent_settings")
     return f"{case.get('agent', '?')}" + (f" ({_changes(settings)})" if settings else "")
 
@@ -195,6 +257,12 @@ def labels(cases: Iterable[Result]) -> list[str]:
     rank = _rank(agents.names())
     found = {label_of(case): str(case.get("agent")) for case in cases}
     return sorted(found, key=lambda label: (rank(found[label]), label))
+
+
+def by_label(cases: Iterable[Result]) -> dict[str, list[Result]]:
+    """Group cases by the label of their agent, in the order of `labels`."""
+    cases = list(cases)
+    return {label: [case for case in cases if label_of(case) == label] for label in labels(cases)}
 
 
 def current(cases: Iterable[Result]) -> list[Result]:
@@ -219,8 +287,8 @@ def ordered(cases: Iterable[Result]) -> list[Result]:
     return sorted(
         cases,
         key=lambda case: (
-            _departures(case),
-            setting_of(case),
+            (setting := setting_of(case)).departures,
+            str(setting),
             path(str(case.get("trajectory"))),
             agent(str(case.get("agent"))),
             label_of(case),
@@ -272,13 +340,17 @@ def _end_words(cases: Sequence[Result]) -> str:
     return ", ".join(f"{count} {end}" for end, count in ends.items())
 
 
-def _learning_words(cases: Iterable[Result]) -> str:
-    """What learning cost; "" for agents designed by hand, and where results do not tell."""
-    told = [words(case["training"]) for case in cases if case.get("training")]
-    return "; ".join(dict.fromkeys(told))
+def trainings(cases: Iterable[Result]) -> list[tuple[str, dict[str, Any]]]:
+    """Return label and training of every learned policy, each distinct one once."""
+    found: list[tuple[str, dict[str, Any]]] = []
+    for label, group in by_label(cases).items():
+        for case in group:
+            if (training := case.get("training")) and (label, training) not in found:
+                found.append((label, dict(training)))
+    return found
 
 
-def _agent_row(setting: str, trajectory: str, label: str, cases: Sequence[Result]) -> Row:
+def _agent_row(setting: Setting, trajectory: str, label: str, cases: Sequence[Result]) -> Row:
     done = [case for case in cases if case.get("status") == "ok"]
     values = {}
     for column in (*TRACKING, *EFFORT, *FURTHER):
@@ -294,14 +366,14 @@ def _agent_row(setting: str, trajectory: str, label: str, cases: Sequence[Result
         end=_end_words(cases),
         failures=_failure_words(done) if done else "–",
         violations=_violation_words([case["metrics"] for case in done]) if done else "–",
-        learning=_learning_words(cases),
+        learning="; ".join(dict.fromkeys(words(training) for _, training in trainings(cases))),
         runs=len(done),
     )
 
 
 def build_rows(cases: Iterable[Result]) -> list[Row]:
     """All rows in order: per setting and trajectory the published one, then the agents'."""
-    groups: dict[tuple[str, str], dict[str, list[Result]]] = {}
+    groups: dict[tuple[Setting, str], dict[str, list[Result]]] = {}
     for case in ordered(current(cases)):
         key = setting_of(case), str(case.get("trajectory"))
         groups.setdefault(key, {}).setdefault(label_of(case), []).append(case)
@@ -316,17 +388,17 @@ def build_rows(cases: Iterable[Result]) -> list[Row]:
     return rows
 
 
-def by_setting(rows: Iterable[Row]) -> dict[str, list[Row]]:
+def by_setting(rows: Iterable[Row]) -> dict[Setting, list[Row]]:
     """Rows by their setting, in order."""
-    groups: dict[str, list[Row]] = {}
+    groups: dict[Setting, list[Row]] = {}
     for row in rows:
         groups.setdefault(row.setting, []).append(row)
     return groups
 
 
-def cases_by_setting(cases: Iterable[Result]) -> dict[str, list[Result]]:
+def cases_by_setting(cases: Iterable[Result]) -> dict[Setting, list[Result]]:
     """Cases by their setting, in order."""
-    groups: dict[str, list[Result]] = {}
+    groups: dict[Setting, list[Result]] = {}
     for case in cases:
         groups.setdefault(setting_of(case), []).append(case)
     return groups

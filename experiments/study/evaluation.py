@@ -14,7 +14,7 @@ from agents.weight_tuning.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import PARTS, SCALES, failed, parts_of, scores_of
-from experiments.run.band_metrics import BANDS
+from experiments.run.metrics import BANDS
 from experiments.run.suites import HELD_OUT, RAW, RAW_PREVIEW, SIX
 from experiments.tuning.drives import threads
 from experiments.tuning.tuner import Result

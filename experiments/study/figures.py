@@ -10,7 +10,7 @@ from agents.weight_tuning.policy import load
 from agents.weights import TrackingWeights
 from experiments.report.charts import Chart, Scale, around, decades
 from experiments.report.page import Panel, Styles
-from experiments.run.band_metrics import BANDS
+from experiments.run.metrics import BANDS
 from experiments.run.statistics import Interval
 from experiments.study.evaluation import EvaluationSet, loop_with
 from experiments.study.study import Study

@@ -14,7 +14,7 @@ from experiments.report.page import (
     line_styles,
     paragraph,
 )
-from experiments.run.band_metrics import BANDS
+from experiments.run.metrics import BANDS
 from experiments.run.provenance import hardware, revision, versions
 from experiments.run.statistics import Interval
 from experiments.study import figures, tables

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.weight_tuning.score import COMFORT, PARTS, TRACKING
-from experiments.run.band_metrics import BANDS
+from experiments.run.metrics import BANDS
 from experiments.run.statistics import (
     Interval,
     interquartile_mean,

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from experiments.report.build import write_report
 from experiments.report.page import asset
-from experiments.run.console_tables import console_table
+from experiments.run.console_tables import all_tables
 from experiments.run.store import ResultStore
 
 METRICS = {
@@ -109,5 +109,5 @@ class Outline(HTMLParser):
 def printed(results, width=120):
     console = Console(width=width, record=True, color_system=None, file=None, quiet=False)
     with console.capture() as captured:
-        console.print(console_table(results))
+        console.print(all_tables(results))
     return captured.get()

@@ -63,7 +63,7 @@ def test_what_is_not_the_same_experiment_is_not_averaged():
         {"vehicle_changes": {"max_lateral_velocity_ratio": 0.5}},
     ]
     results = [case(k, **change) for k, change in enumerate(changes)]
-    settings = tables.by_setting(tables.build_rows([case(99), *results]))
+    settings = [*map(str, tables.by_setting(tables.build_rows([case(99), *results])))]
     assert len(settings) == 1 + len(changes)
     assert "m2-minibus · variable speed" in settings
     assert "m2-minibus · with max_lateral_velocity_ratio=0.5 · variable speed" in settings
@@ -80,7 +80,7 @@ def test_the_default_setting_stands_first_and_raw_waypoints_apart():
         case(1, vehicle="course-car"), case(2, trajectory="T2-raw"), case(3),
         case(4, vehicle="course-car", speed_mode="fixed"),
     ]  # fmt: skip
-    assert list(tables.by_setting(tables.build_rows(results))) == [
+    assert [*map(str, tables.by_setting(tables.build_rows(results)))] == [
         "m2-minibus · variable speed",
         "course-car · variable speed",
         "m2-minibus · variable speed · raw waypoints",

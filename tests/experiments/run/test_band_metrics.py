@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from experiments.run import metrics
-from experiments.run.band_metrics import BANDS, by_band, trapezoidal_weights
+from experiments.run.metrics import BANDS, by_band, trapezoidal_weights
 from experiments.run.rollout import Trace
 from lpv_track_env import vehicle
 from trajectories import ReferencePath

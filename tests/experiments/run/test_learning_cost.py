@@ -8,7 +8,7 @@ import pytest
 from agents.learned.policy import Policy, write
 from experiments.run import learning_cost, metrics, tables
 from experiments.run.case import run_case
-from experiments.run.learning_words import count, duration, words
+from experiments.run.learning_cost import count, duration, words
 from experiments.run.store import ResultStore
 from lpv_track_env.observation import ObservationLayout
 from tests.helpers.made_results import (
