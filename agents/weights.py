@@ -1,9 +1,9 @@
-"""Weights of the NMPC's cost, and schedules that choose them from curvature."""
+"""Weights of the NMPC's cost, and schedules of weights over the path's curvature."""
 
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,20 +13,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from trajectories import CurvatureBands, ReferencePath
 from trajectories.fileio import write_atomically
+from trajectories.naming import choose
 
 Array = NDArray[np.float64]
 
 LOWEST, HIGHEST = 1e-4, 1e6
-"""Bounds of every weight; `TrackingWeights.clipped` brings others within them."""
-FORMAT, WITHOUT_SLEW = "weight-schedule/2", "weight-schedule/1"
+"""Bounds of every weight that the NMPC uses."""
+FORMAT = "weight-schedule/2"
+"""Format of a schedule's file."""
+WITHOUT_SLEW = "weight-schedule/1"
+"""Earlier format, without a slew limit, which is still read."""
 
 
 @dataclass(frozen=True)
 class TrackingWeights:
-    """Diagonals of the cost's matrices: Q (stage) and S (end) on [vx, psi, X, Y], R on [a, delta].
+    """Diagonals of the cost's Q (stage) and S (terminal) on [vx, psi, X, Y], and R on [a, delta].
 
-    Only ratios matter to the plan. The defaults track all six trajectories within centimetres:
-    heading is weighted a tenth of position, since a car in a bend drives with sideslip and a
+    Only their ratios affect the plan. The defaults track all six trajectories within centimetres.
+    Heading has a tenth of the weight of position: a car drives through a bend with sideslip, so a
     heading error of zero would cost lateral error.
 
     Raises
@@ -49,12 +53,12 @@ class TrackingWeights:
             object.__setattr__(self, name, values)
 
     def as_array(self) -> Array:
-        """Q, S, R in one vector, shape (10,)."""
+        """Return Q, S, R in one vector, (10,)."""
         return np.array([*self.Q, *self.S, *self.R])
 
     @classmethod
     def from_array(cls, values: ArrayLike) -> "TrackingWeights":
-        """Inverse of `as_array`."""
+        """Make weights of a vector (10,): the inverse of `as_array`."""
         array = np.asarray(values, dtype=np.float64)
         if array.shape != (10,):
             raise ValueError(f"10 weights are needed, not shape {array.shape}")
@@ -62,18 +66,13 @@ class TrackingWeights:
         return cls(tuple(flat[:4]), tuple(flat[4:8]), tuple(flat[8:]))
 
     def clipped(self) -> "TrackingWeights":
-        """Every weight brought within [LOWEST, HIGHEST]."""
+        """Return the weights clipped to [LOWEST, HIGHEST]."""
         return self.from_array(np.clip(self.as_array(), LOWEST, HIGHEST))
-
-    def blended(self, other: "TrackingWeights", share: float) -> "TrackingWeights":
-        """Geometric mean with another set: this one at share 0, the other at 1."""
-        here, there = (np.log(w.clipped().as_array()) for w in (self, other))
-        return self.from_array(np.exp((1.0 - share) * here + share * there))
 
 
 @dataclass(frozen=True)
 class WeightSchedule:
-    """Q and S (and R) per curvature band.
+    """Weights per band of the path's curvature; `agents.nmpc.schedule` follows it.
 
     Parameters
     ----------
@@ -83,18 +82,17 @@ class WeightSchedule:
         One set per band, from the straightest to the sharpest.
     blend
         Half width, as a share of a threshold, of the zone around it in which the two sets are
-        blended geometrically; 0 switches hard, with the bands' hysteresis.
+        blended geometrically. 0 switches at once, with the bands' hysteresis.
     slew
-        Largest change of every weight's natural logarithm, 1/s, from the set in use towards the
-        one that is chosen; None does not limit it.
+        Largest rate of change of each weight's natural logarithm, 1/s; None: no limit.
     provenance
-        Where the numbers come from, plain JSON values.
+        Origin of the numbers, plain JSON.
 
     Raises
     ------
     ValueError
-        If the number of sets does not fit the bands, blending zones would overlap, or the slew
-        limit is not positive.
+        If the number of sets differs from that of the bands, the blending zones overlap, or the
+        slew limit is not positive.
     """
 
     bands: CurvatureBands
@@ -116,26 +114,11 @@ class WeightSchedule:
             raise ValueError(f"slew must be positive, not {self.slew}")
 
     def for_path(self, path: ReferencePath) -> TrackingWeights:
-        """The paper's rule: one set, chosen by the path's sharpest curvature."""
+        """Return the set for the path's sharpest curvature, the rule of the paper."""
         return self.weights[self.bands.select(path.curvature)]
 
-    def select(
-        self, curvature: Sequence[float] | Array, band: int | None = None
-    ) -> tuple[TrackingWeights, int]:
-        """Weights for a preview of curvature (1/m), and the band to hand in with the next call."""
-        chosen = self.bands.select(curvature, band)
-        if self.blend == 0.0:
-            return self.weights[chosen], chosen
-        sharpest = float(np.max(np.abs(curvature), initial=0.0))
-        for k, edge in enumerate(self.bands.thresholds):
-            low, high = edge * (1.0 - self.blend), edge * (1.0 + self.blend)
-            if low < sharpest < high:
-                share = (sharpest - low) / (high - low)
-                return self.weights[k].blended(self.weights[k + 1], share), chosen
-        return self.weights[int(self.bands.classify(sharpest))], chosen
-
     def as_dict(self) -> dict[str, Any]:
-        """All of it, as its file and the files of policies that start from it hold it."""
+        """Return the content of its file, which files of weight policies contain, too."""
         return {
             "format": FORMAT,
             "bands": dataclasses.asdict(self.bands),
@@ -147,12 +130,12 @@ class WeightSchedule:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> "WeightSchedule":
-        """Inverse of `as_dict`, also for what JSON makes of it.
+        """Make a schedule of the result of `as_dict`, also after it has been through JSON.
 
         Raises
         ------
         ValueError
-            In one line, if it is not of that form.
+            In one line, for anything else.
         """
         try:
             if content.get("format") not in (FORMAT, WITHOUT_SLEW):
@@ -175,17 +158,17 @@ class WeightSchedule:
             raise ValueError(" ".join(str(error).split())) from error
 
     def write(self, file: Path) -> None:
-        """Write as JSON, atomically."""
+        """Write the schedule as JSON, atomically."""
         write_atomically(Path(file), json.dumps(self.as_dict(), indent=2).encode())
 
     @classmethod
     def read(cls, file: Path) -> "WeightSchedule":
-        """Read what `write` wrote.
+        """Read a schedule written by `write`.
 
         Raises
         ------
         ValueError
-            One line that names the file, if it cannot be read or is not such a schedule.
+            In one line that names the file, if it cannot be read or is not a schedule.
         """
         try:
             return cls.from_dict(json.loads(Path(file).read_text(encoding="utf-8")))
@@ -194,15 +177,49 @@ class WeightSchedule:
             raise ValueError(f"weight schedule {file}: {reason}") from error
 
 
+def weights_from(value: object) -> TrackingWeights | WeightSchedule:
+    """Return weights as a user may give them: in code, in a file, or typed on a command line.
+
+    Parameters
+    ----------
+    value
+        Weights, a schedule, or the path of a schedule's .json; or a mapping: Q, S and R, or a
+        schedule as in its file. Entries left out of a mapping have their defaults.
+
+    Raises
+    ------
+    ValueError
+        In one line, for anything else.
+    """
+    if isinstance(value, TrackingWeights | WeightSchedule):
+        return value
+    if isinstance(value, str | Path):
+        return WeightSchedule.read(Path(value))
+    if not isinstance(value, Mapping):
+        raise ValueError(  # noqa: TRY004  as for every unusable setting
+            f"weights must be weights, a schedule or its file, not {type(value).__name__}"
+        )
+    try:
+        if "weights" in value:
+            bands = {**dataclasses.asdict(CurvatureBands()), **value.get("bands", {})}
+            defaults = {"format": FORMAT, "blend": 0.0, "provenance": {}}
+            return WeightSchedule.from_dict({**defaults, **value, "bands": bands})
+        for name in value:
+            choose("matrix of weights", name, ("Q", "S", "R"))
+        return TrackingWeights(**value)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"weights: {' '.join(str(error).split())}") from error
+
+
 def in_words(weights: ArrayLike) -> dict[str, str]:
-    """Weights (10,) in words of two digits for a picture, a row each: Q, S, R."""
+    """Format weights (10,) with two digits, for a picture: a text each for Q, S and R."""
     q, s, r = np.split(np.asarray(weights, dtype=np.float64), (4, 8))
     return {
-        label: "   ".join(_short(value) for value in values.tolist())
+        label: "   ".join(_two_digits(value) for value in values.tolist())
         for label, values in (("Q", q), ("S", s), ("R", r))
     }
 
 
-def _short(value: float) -> str:
-    """Write two digits, of numbers from 100 to 9999 all."""
+def _two_digits(value: float) -> str:
+    """Format a number with two significant digits; numbers from 100 to 9999 as integers."""
     return f"{value:.0f}" if 100.0 <= value < 1e4 else f"{value:.2g}"

@@ -11,7 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
+from agents.nmpc.schedule import NO_BAND, Switching
+from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule, weights_from
+from lpv_track_env.observation import PREVIEW_START
 from trajectories import CurvatureBands, load
 
 EDGES = (0.005, 0.02, 0.05)
@@ -63,20 +65,33 @@ def test_clipped_brings_every_weight_within_bounds() -> None:
     assert clipped.clipped() == clipped
 
 
-@given(weights, weights, st.floats(0, 1))
+def select(
+    schedule: WeightSchedule, curvature: list[float], band: int = NO_BAND
+) -> tuple[TrackingWeights, int]:
+    """Weights and band that an NMPC uses for a preview of curvature, after another band."""
+    steps = len(curvature)
+    rows = np.zeros((1, PREVIEW_START + 2 * steps))
+    rows[0, PREVIEW_START : PREVIEW_START + steps] = curvature
+    bands, used = np.array([band]), np.zeros((1, 10))
+    Switching(schedule, 0.05).choose(rows, steps, bands, used)
+    return TrackingWeights.from_array(used[0]), int(bands[0])
+
+
+@given(weights, weights, st.floats(0.01, 0.99))
+@settings(deadline=None)  # compiles
 def test_blended_is_the_geometric_mean(
     one: TrackingWeights, other: TrackingWeights, share: float
 ) -> None:
-    mean = one.blended(other, share).as_array()
+    blended = WeightSchedule(CurvatureBands((1.0,), ("low", "high")), (one, other), blend=0.5)
+    mean = select(blended, [0.5 + share])[0].as_array()
     expected = one.as_array() ** (1 - share) * other.as_array() ** share
     np.testing.assert_allclose(mean, expected, rtol=1e-9)
-    np.testing.assert_allclose(one.blended(other, 0.0).as_array(), one.as_array(), rtol=1e-12)
-    np.testing.assert_allclose(one.blended(other, 1.0).as_array(), other.as_array(), rtol=1e-12)
 
 
 def test_half_way_between_1_and_100_is_10() -> None:
-    one, hundred = (TrackingWeights.from_array([value] * 10) for value in (1.0, 100.0))
-    np.testing.assert_allclose(one.blended(hundred, 0.5).as_array(), 10.0)
+    sets = tuple(TrackingWeights.from_array([value] * 10) for value in (1.0, 100.0))
+    blended = WeightSchedule(CurvatureBands((1.0,), ("low", "high")), sets, blend=0.5)
+    np.testing.assert_allclose(select(blended, [1.0])[0].as_array(), 10.0)
 
 
 @pytest.mark.parametrize(
@@ -96,20 +111,20 @@ def test_the_number_of_sets_fits_the_bands() -> None:
 
 
 def test_select_takes_the_sharpest_of_either_sign() -> None:
-    assert schedule().select([0.0, 0.001]) == (SETS[0], 0)
-    assert schedule().select([0.0, -0.03, 0.01]) == (SETS[2], 2)
-    assert schedule().select(np.array([0.0, -0.03, 0.06]), 0) == (SETS[3], 3)
+    assert select(schedule(), [0.0, 0.001]) == (SETS[0], 0)
+    assert select(schedule(), [0.0, -0.03, 0.01]) == (SETS[2], 2)
+    assert select(schedule(), [0.0, -0.03, 0.06], 0) == (SETS[3], 3)
 
 
 @pytest.mark.parametrize("blend", [0.0, 0.2])
 def test_select_on_no_preview_is_straight(blend: float) -> None:
-    assert schedule(blend).select([]) == (SETS[0], 0)
+    assert select(schedule(blend), []) == (SETS[0], 0)
 
 
 def flicker(hysteresis: float) -> list[int]:
-    bands, band = [], None
+    bands, band = [], NO_BAND
     for k in range(40):
-        _, band = schedule(hysteresis=hysteresis).select([0.02 * (1 + 0.05 * (-1) ** k)], band)
+        _, band = select(schedule(hysteresis=hysteresis), [0.02 * (1 + 0.05 * (-1) ** k)], band)
         bands.append(band)
     return bands
 
@@ -120,12 +135,12 @@ def test_hysteresis_does_not_flicker() -> None:
 
 
 def test_hysteresis_lets_go_below_its_share() -> None:
-    held, band = schedule().select([0.0161], 2)
+    held, band = select(schedule(), [0.0161], 2)
     assert (held, band) == (SETS[2], 2)
-    assert schedule().select([0.0159], 2) == (SETS[1], 1)
-    assert schedule().select([0.0], 3) == (SETS[0], 0)
+    assert select(schedule(), [0.0159], 2) == (SETS[1], 1)
+    assert select(schedule(), [0.0], 3) == (SETS[0], 0)
     # Upwards at once, also over two bands.
-    assert schedule().select([0.0201], 0) == (SETS[2], 2)
+    assert select(schedule(), [0.0201], 0) == (SETS[2], 2)
 
 
 near_an_edge = st.builds(
@@ -141,13 +156,13 @@ near_an_edge = st.builds(
     blend=st.sampled_from([0.1, 0.25, 0.4]),
     curvature=near_an_edge | st.floats(0.0, 0.3),
 )
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 def test_blending_is_continuous(
     sets: tuple[TrackingWeights, ...], blend: float, curvature: float
 ) -> None:
     blended = WeightSchedule(CurvatureBands(EDGES), sets, blend)
     here, there = (
-        np.log(blended.select([value])[0].as_array())
+        np.log(select(blended, [value])[0].as_array())
         for value in (curvature, curvature * (1 + 1e-6))
     )
     # Slope over one zone: log(HIGHEST / LOWEST) on a width of 2 blend, relative to its edge.
@@ -157,10 +172,11 @@ def test_blending_is_continuous(
 
 def test_blending_ends_at_the_bands_own_sets_and_meets_half_way() -> None:
     blended = schedule(0.25)
-    assert blended.select([0.0149])[0] is SETS[1]
-    assert blended.select([0.0251])[0] is SETS[2]
-    middle = blended.select([-0.02])[0]
-    np.testing.assert_allclose(middle.as_array(), SETS[1].blended(SETS[2], 0.5).as_array())
+    assert select(blended, [0.0149])[0] == SETS[1]
+    assert select(blended, [0.0251])[0] == SETS[2]
+    middle = select(blended, [-0.02])[0]
+    ends = np.log([SETS[1].as_array(), SETS[2].as_array()])
+    np.testing.assert_allclose(middle.as_array(), np.exp(ends.mean(axis=0)))
 
 
 @pytest.mark.parametrize("blend", [0.43, 0.99, 1.0, -0.1, math.nan])
@@ -338,7 +354,51 @@ def test_garbage_is_read_or_refused(
     except ValueError as error:
         checked(scratch, error)
         return
-    chosen, _ = found.select([0.03])
+    chosen, _ = select(found, [0.03])
     assert np.isfinite(chosen.as_array()).all()
     found.write(scratch)
     WeightSchedule.read(scratch)
+
+
+# Weights as users give them.
+
+
+def test_weights_are_taken_as_they_are_from_a_file_or_typed(tmp_path: Path) -> None:
+    own = schedule(0.3, slew=4.0)
+    own.write(tmp_path / "own.json")
+    assert weights_from(SETS[1]) is SETS[1]
+    assert weights_from(own) is own
+    assert weights_from(tmp_path / "own.json") == weights_from(str(tmp_path / "own.json")) == own
+    assert weights_from(own.as_dict()) == weights_from(json.loads(json.dumps(own.as_dict()))) == own
+    assert weights_from({}) == TrackingWeights()
+    assert weights_from({"Q": [1, 1, 20, 20]}) == TrackingWeights(Q=(1, 1, 20, 20))
+    typed = {"weights": [{"R": [k, 1]} for k in (1, 2, 3, 4)], "slew": 6.0}
+    found = weights_from(typed)
+    assert isinstance(found, WeightSchedule)
+    assert found.bands == CurvatureBands()
+    assert (found.blend, found.slew) == (0.0, 6.0)
+    assert [one.R for one in found.weights] == [(k, 1.0) for k in (1.0, 2.0, 3.0, 4.0)]
+    two = {"weights": [{}, {}], "bands": {"thresholds": [0.01], "names": ["low", "high"]}}
+    assert len(weights_from(two).weights) == 2  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        (7, "weights must be weights, a schedule or its file, not int"),
+        ({"P": [1]}, "unknown matrix of weights 'P'; known: Q, S, R"),
+        ({"Q": [1, 2]}, "Q needs 4 weights, not 2"),
+        ({"Q": 3}, "not iterable"),
+        ({"Q": ["a", 1, 1, 1]}, "could not convert"),
+        ({"R": [0.1, -1]}, "R must be finite and not negative"),
+        ({"weights": [{}]}, "4 bands need as many sets, not 1"),
+        ({"weights": 3}, "not iterable"),
+        ({"weights": [], "bands": 7}, "not a mapping"),
+        ({"weights": [{}] * 4, "format": "mine/1"}, "format is 'mine/1'"),
+        ("no_such.json", "weight schedule no_such.json"),
+    ],
+)
+def test_what_is_no_weights_is_refused_in_one_line(value: Any, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason) as raised:
+        weights_from(value)
+    assert "\n" not in str(raised.value)
