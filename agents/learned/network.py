@@ -1,6 +1,6 @@
-"""A policy's features and network, compiled: rows of observations to actions.
+"""Features and network of a policy in compiled code: rows of observations to actions.
 
-Every row is worked out alone and in the same order, so its action does not depend on the batch.
+Every row is evaluated alone and in the same order, so its action does not depend on the batch.
 """
 
 import math
@@ -11,37 +11,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.learned.policy import ORIGINS, Policy
-from lpv_track_env.observation import SCALARS
+from lpv_track_env.observation import ACCELERATION, STEERING_ANGLE
 from trajectories.compilation import compiled, compiled_inline
 
 Array = NDArray[Any]
 
 FROM_ACTUATORS, FROM_BASE = ORIGINS.index("actuators"), ORIGINS.index("lpv-nmpc")
-IN_FORCE_A, IN_FORCE_DELTA = (
-    [name for name, _, _ in SCALARS].index(entry) for entry in ("acceleration", "steering_angle")
-)
 
-START, INPUTS, OUTPUTS, BEND = range(4)
-"""Of a layer in `table`: where its transposed weights (inputs, outputs) begin in `weights`, its
-bias following; what is done to its outputs."""
+# Columns of a layer in `table`: index in `weights` of its transposed weights (inputs, outputs),
+# which its bias follows; numbers of inputs and outputs; activation of the outputs.
+START, INPUTS, OUTPUTS, ACTIVATION = range(4)
 
-BENDS = ("tanh", "relu", "clip")
+ACTIVATIONS = ("tanh", "relu", "clip")
+"""Names of the activations by their codes."""
 TANH, RELU, CLIP = range(3)
 
-# Of `numbers`, (9,): the features' limit; a and delta of each.
+# Indices in `numbers` (9,): limit of the features; a, then delta, of each of the others.
 LIMIT, CENTRE, HALF, LOW, HIGH = 0, 1, 3, 5, 7
 
 
 @compiled_inline
 def dense(x: Array, layer: Array, weights: Array, y: Array) -> None:
-    """Fill y = W x + b; the inner loops run over outputs, side by side in memory."""
+    """Fill y = W x + b; the inner loops run over outputs, which are adjacent in memory."""
     inputs, outputs = layer[INPUTS], layer[OUTPUTS]
     at = layer[START]
     bias = weights[at + inputs * outputs : at + inputs * outputs + outputs]
     for j in range(outputs):
         y[j] = bias[j]
     blocks = inputs // 4
-    # Four inputs at a time, so that y is loaded and stored a quarter as often.
+    # Four inputs at a time: y is loaded and stored a quarter as often.
     for block in range(blocks):
         i = 4 * block
         x0, x1, x2, x3 = x[i], x[i + 1], x[i + 2], x[i + 3]
@@ -59,8 +57,8 @@ def dense(x: Array, layer: Array, weights: Array, y: Array) -> None:
 
 
 @compiled_inline
-def bend(y: Array, outputs: int, kind: int, limit: Any) -> None:
-    """Apply tanh, relu, or clip to [-limit, limit]; what is no number stays none."""
+def activate(y: Array, outputs: int, kind: int, limit: Any) -> None:
+    """Apply tanh, relu, or a clip to [-limit, limit]; NaN stays NaN."""
     zero = np.float32(0.0)
     if kind == TANH:
         for j in range(outputs):
@@ -79,7 +77,7 @@ def act(
     rows: Array, weights: Array, table: Array, numbers: Array, mirrors: Array, origin: int,
     scratch: Array, actions: Array,
 ) -> int:  # fmt: skip
-    """Put an action in the place of each row's base action; how many rows have none.
+    """Replace the base action of each row by the policy's action; return how many rows have none.
 
     Parameters
     ----------
@@ -90,44 +88,44 @@ def act(
     numbers
         Limit, centre, half, low and high, float64.
     mirrors
-        (looks, inputs) float32: factors of the inputs for each look at them, all 1 in the first; a
-        second one is mirrored.
+        (passes, inputs) float32: factors of the inputs in each pass through the network, 1 in the
+        first; a second pass, if there is one, is mirrored.
     origin
         Index in `ORIGINS`.
     scratch
         (2, widest) float32.
     actions
-        (n, 2) float64: read for origin "lpv-nmpc", then written; NaN where the row is not finite
-        or the network makes no number of it.
+        (n, 2) float64: base actions for origin "lpv-nmpc", replaced by actions; NaN where the row
+        or the network's output is not finite.
     """
-    size, looks, lost = rows.shape[1], mirrors.shape[0], 0
-    share = 1.0 / looks
+    size, passes, lost = rows.shape[1], mirrors.shape[0], 0
+    share = 1.0 / passes
     for row in range(rows.shape[0]):
         finite = True
         for i in range(size):
             finite = finite and math.isfinite(np.float32(rows[row, i]))
         base_a, base_delta = 0.0, 0.0
         if origin == FROM_ACTUATORS:
-            base_a, base_delta = rows[row, IN_FORCE_A], rows[row, IN_FORCE_DELTA]
+            base_a, base_delta = rows[row, ACCELERATION], rows[row, STEERING_ANGLE]
         elif origin == FROM_BASE:
             base_a, base_delta = actions[row, 0], actions[row, 1]
         u_a = u_delta = 0.0
-        for look in range(looks):
+        for mirrored in range(passes):
             x, y = scratch[0], scratch[1]
             for i in range(size):
-                x[i] = np.float32(rows[row, i]) * mirrors[look, i]
+                x[i] = np.float32(rows[row, i]) * mirrors[mirrored, i]
             if origin == FROM_BASE:
-                x[size] = np.float32(base_a) * mirrors[look, size]
-                x[size + 1] = np.float32(base_delta) * mirrors[look, size + 1]
+                x[size] = np.float32(base_a) * mirrors[mirrored, size]
+                x[size + 1] = np.float32(base_delta) * mirrors[mirrored, size + 1]
             limit = np.float32(numbers[LIMIT])
             for k in range(table.shape[0]):
                 layer = table[k]
                 dense(x, layer, weights, y)
-                bend(y, layer[OUTPUTS], layer[BEND], limit)
+                activate(y, layer[OUTPUTS], layer[ACTIVATION], limit)
                 limit = np.float32(1.0)
                 x, y = y, x
             u_a += share * x[0]
-            u_delta += share * x[1] * (1.0 - 2.0 * look)
+            u_delta += share * x[1] * (1.0 - 2.0 * mirrored)
         a = base_a + numbers[CENTRE] + numbers[HALF] * u_a
         delta = base_delta + numbers[CENTRE + 1] + numbers[HALF + 1] * u_delta
         if finite and not (math.isnan(a) or math.isnan(delta)):
@@ -141,7 +139,7 @@ def act(
 
 @dataclass(eq=False)
 class Network:
-    """A policy as `act` takes it."""
+    """A policy in the arrays that `act` takes."""
 
     weights: NDArray[np.float32]
     table: NDArray[np.int64]
@@ -152,12 +150,12 @@ class Network:
 
     @classmethod
     def of(cls, policy: Policy, low: Array, high: Array) -> "Network":
-        """Pack a policy's numbers, with the bounds (2,) of actions in SI units."""
+        """Pack a policy and the bounds (2,) of its actions, in SI units."""
         stages = [(policy.feature_weight, policy.feature_bias), *policy.layers]
-        bends = ["clip", *[policy.activation] * (len(policy.layers) - 1), policy.squash]
+        activations = ["clip", *[policy.activation] * (len(policy.layers) - 1), policy.squash]
         table, packed, start = [], [], 0
-        for (weight, bias), kind in zip(stages, bends, strict=True):
-            table.append([start, weight.shape[1], weight.shape[0], BENDS.index(kind)])
+        for (weight, bias), kind in zip(stages, activations, strict=True):
+            table.append([start, weight.shape[1], weight.shape[0], ACTIVATIONS.index(kind)])
             packed += [weight.T.ravel(), bias]
             start += weight.size + bias.size
         numbers = np.concatenate([[policy.feature_limit], policy.centre, policy.half, low, high])
@@ -171,7 +169,7 @@ class Network:
         )
 
     def act(self, rows: Array, actions: Array) -> int:
-        """Actions (n, 2) of rows (n, size), see `act`; how many rows have none."""
+        """Fill actions (n, 2) for rows (n, size), see `act`; return how many rows have none."""
         return act(
             rows, self.weights, self.table, self.numbers, self.mirrors, self.origin, self.scratch,
             actions,

@@ -1,5 +1,5 @@
-"""Choosing the NMPC's weights while it drives: what is watched, environments, policies, an agent.
+"""Choice of the NMPC's weights while it drives: features, environments, policies, an agent.
 
-`features` says what a chooser sees, `env` and `vector_env` are `lpv_track_env/WeightTuning-v0`,
-`policy` is what was learned there, `files` its files, `agent` drives with it.
+`features` defines what weights are chosen on, `env` and `vector_env` are the environment
+`lpv_track_env/WeightTuning-v0`, `policy` has the policies learned there, `agent` drives with one.
 """

@@ -1,4 +1,4 @@
-"""What a choice of weights means: how an action becomes Q and S of a band, within safe bounds."""
+"""Choice of weights: how an action becomes the weights of a curvature band, within safe bounds."""
 
 import math
 from collections.abc import Mapping
@@ -6,11 +6,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from agents.learned.policy import checked_number
 from agents.nmpc.schedule import rules_of
-from agents.weight_tuning.features import TUNED
+from agents.weight_tuning.features import LIMIT, TUNED, size
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
 from trajectories import CurvatureBands
 from trajectories.compilation import compiled
@@ -18,11 +19,12 @@ from trajectories.naming import choose
 
 Array = NDArray[Any]
 
+# Indices in [Q, S], (vx, psi, X, Y) each, of the weights that a joint action multiplies.
 SPEED, HEADING, POSITION = (0, 4), (1, 5), (2, 3, 6, 7)
-"""Indices of Q and S, (vx, psi, X, Y) each, that a joint action multiplies."""
 
 
 def _joint(*groups: tuple[int, ...]) -> Array:
+    """Return a matrix (8, groups) whose columns mark the weights of a group with 1."""
     directions = np.zeros((TUNED, len(groups)))
     for column, group in enumerate(groups):
         directions[list(group), column] = 1.0
@@ -34,36 +36,39 @@ DIRECTIONS: Mapping[str, Array] = {
     "stages": _joint((0,), (1,), (2, 3), (4,), (5,), (6, 7)),
     "all": np.eye(TUNED),
 }
-"""What the entries of an action multiply: speed, heading and position in Q and S alike; the three
-in Q, then the three in S; or each of the eight weights."""
+"""Weights that the entries of an action multiply: speed, heading and position, in Q and S alike
+("joint") or first in Q and then in S ("stages"); or each of the eight weights ("all")."""
 
 LONGEST_WINDOW = 1e9
-"""s: its control periods are counted in 64 bits."""
+"""Longest window, s; its control periods are counted in 64 bits."""
+
+SLEW = 6.0
+"""Default slew limit of the weights, 1/s: a factor of at most 11 within a window of 0.4 s."""
 
 
 @dataclass(frozen=True)
 class WeightChoice:
-    """What may be chosen, from what, and how often.
+    """Set of weights to choose from, meaning of an action, and time between decisions.
 
     Parameters
     ----------
     base
-        Weights that are multiplied, a set a band; its slew limit holds for every change, its
-        blending for none. One set stands for all bands, with `SLEW` for a limit.
+        Schedule whose weights an action multiplies. Its slew limit applies to every change; its
+        blending is not used. A single set of weights applies to all bands, with the limit `SLEW`.
     directions
         "joint", "stages" or "all", see `DIRECTIONS`.
     span
-        An action of 1 multiplies by it, one of -1 divides.
+        An entry of 1 multiplies weights by it, one of -1 divides them.
     catalogue
-        Sets to choose one of instead, R too; an action is an index then.
+        Sets of weights, R included; if there are any, an action is the index of one.
     window
-        s between decisions, in whole control periods, at most `LONGEST_WINDOW`; a change of band
-        calls for one at once.
+        Time between decisions, s, rounded to control periods; at most `LONGEST_WINDOW`. A change of
+        band leads to a decision at once.
 
     Raises
     ------
     ValueError
-        For a setting that is out of range or unknown.
+        For an unknown setting, or one that is out of range.
     """
 
     base: WeightSchedule | TrackingWeights = field(default_factory=TrackingWeights)
@@ -89,41 +94,41 @@ class WeightChoice:
 
     @property
     def schedule(self) -> WeightSchedule:
-        """The base."""
+        """The base as a schedule."""
         assert isinstance(self.base, WeightSchedule)
         return self.base
 
     @property
     def bands(self) -> CurvatureBands:
-        """Bands of curvature."""
+        """Bands of the base."""
         return self.schedule.bands
 
     @property
     def slew(self) -> float:
-        """Largest change of a weight's logarithm, 1/s."""
+        """Largest rate of change of a weight's natural logarithm, 1/s."""
         return math.inf if self.schedule.slew is None else self.schedule.slew
 
     @property
     def sets(self) -> Array:
-        """Base sets, (bands, 10)."""
+        """Weights of the base, (bands, 10)."""
         return np.array([one.clipped().as_array() for one in self.schedule.weights])
 
     @property
     def matrix(self) -> Array:
-        """Directions, (8, entries of an action)."""
+        """Matrix (8, entries of an action) from an action to logarithms of factors."""
         return DIRECTIONS[self.directions]
 
     @property
     def entries(self) -> int:
-        """Numbers of an action, or sets of the catalogue."""
+        """Number of entries of an action, or of sets in the catalogue."""
         return len(self.catalogue) or int(self.matrix.shape[1])
 
     def rules(self, period: float) -> Array:
-        """Rules of switching at a control period (s)."""
+        """Return the rules of switching for a control period (s), see `agents.nmpc.schedule`."""
         return rules_of(self.bands, 0.0, self.slew, period)
 
     def as_packed(self) -> "PackedChoice":
-        """Arrays as `weights_for` takes them."""
+        """Return the arrays that `weights_for` takes."""
         sets = [one.clipped().as_array() for one in self.catalogue]
         return PackedChoice(
             self.sets,
@@ -133,8 +138,50 @@ class WeightChoice:
         )
 
 
-SLEW = 6.0
-"""Of choices, 1/s: within a window of 0.4 s a weight changes by a factor of 11 at most."""
+def observation_space(choice: WeightChoice) -> spaces.Box:
+    """Space of the features of a choice."""
+    shape = (size(len(choice.bands)),)
+    return spaces.Box(-LIMIT, LIMIT, shape, dtype=np.float32)
+
+
+def action_space(choice: WeightChoice) -> spaces.Box | spaces.Discrete[np.int64]:
+    """Space of the actions of a choice."""
+    if choice.catalogue:
+        return spaces.Discrete(len(choice.catalogue))
+    return spaces.Box(-1.0, 1.0, (choice.entries,), dtype=np.float32)
+
+
+def checked_actions(actions: Any, choice: WeightChoice, num_envs: int) -> Array:
+    """Convert actions to float64 (n, entries); an index of a catalogue to a row with a single 1.
+
+    Entries that are not finite are accepted: `weights_for` refuses them.
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape or type, or an index outside the catalogue.
+    """
+    try:
+        given = np.asarray(actions)
+    except ValueError:
+        given = np.empty(0)
+    count = choice.entries
+    if not choice.catalogue:
+        if given.shape != (num_envs, count) or given.dtype.kind not in "fiu":
+            raise ValueError(
+                f"actions must be an array {(num_envs, count)} of numbers in [-1, 1], "
+                f"{choice.directions!r} log-multipliers, not {given.shape} of {given.dtype}"
+            )
+        return np.ascontiguousarray(given, dtype=np.float64)
+    if given.shape != (num_envs,) or given.dtype.kind not in "iu":
+        raise ValueError(
+            f"actions must be {num_envs} indices of a catalogue, not {given.shape} of {given.dtype}"
+        )
+    if not ((given >= 0) & (given < count)).all():
+        wrong = given[(given < 0) | (given >= count)][0]
+        raise ValueError(f"the catalogue has sets 0 to {count - 1}, not {wrong}")
+    chosen: Array = np.eye(count)[given]
+    return chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +199,10 @@ def weights_for(
     action: Array, band: int, sets: Array, matrix: Array, log_span: Any, catalogue: Array,
     chosen: Array,
 ) -> bool:  # fmt: skip
-    """Fill `chosen` (10,) with what an action means in a band; False, and nothing, if it is bad.
+    """Fill `chosen` (10,) with the weights that an action means in a band.
 
-    `action` holds numbers, clipped to [-1, 1], or for a catalogue one for each of its sets, of
-    which the largest chooses. Bad is one with an entry that is not finite.
+    `action` has entries that are clipped to [-1, 1]; or, with a catalogue, one entry per set, of
+    which the largest chooses. Returns False, and fills nothing, if an entry is not finite.
     """
     for j in range(action.shape[0]):
         if not math.isfinite(action[j]):
@@ -184,9 +231,9 @@ def weights_for_all(
     actions: Array, mask: Array, bands: Array, sets: Array, matrix: Array, log_span: Any,
     catalogue: Array, tables: Array, refused: Array,
 ) -> None:  # fmt: skip
-    """`weights_for` for every row that `mask` marks, in its band's row of `tables` (n, bands, 10).
+    """Apply `weights_for` to the rows where `mask` is True, in `tables` (n, bands, 10).
 
-    `refused` (n,) tells of which actions nothing could be made.
+    `refused` (n,) becomes True for actions that are not finite.
     """
     for row in range(actions.shape[0]):
         refused[row] = mask[row] and not weights_for(

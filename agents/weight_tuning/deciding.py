@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.learned.network import CLIP, OUTPUTS, TANH, bend, dense
+from agents.learned.network import ACTIVATION, CLIP, OUTPUTS, TANH, activate, dense
 from agents.weight_tuning.choice import (
     PackedChoice,
     WeightChoice,
@@ -117,8 +117,8 @@ def reconsider(
         layer = layers[k]
         dense(x, layer, network, y)
         # The last one's outputs are clipped where they are used: a catalogue compares them.
-        if layer[3] == TANH:
-            bend(y, layer[OUTPUTS], TANH, np.float32(1.0))
+        if layer[ACTIVATION] == TANH:
+            activate(y, layer[OUTPUTS], TANH, np.float32(1.0))
         x, y = y, x
     outputs = layers[layers.shape[0] - 1, OUTPUTS]
     if not weights_for(x[:outputs], band, sets, matrix, log_span, catalogue, table[max(band, 0)]):

@@ -1,13 +1,13 @@
-"""What a chooser of weights is shown: features of about one, the same for left and right.
+"""Features on which weights are chosen: of magnitude one, the same for left and right.
 
 ====================  =====  ===================================================================
-features              count  meaning, and what they are divided by
+features              count  meaning, and the scale that they are divided by
 ====================  =====  ===================================================================
 situation             8      vx - 10 m/s (10), |vy| (0.5 m/s), |r| (0.3 rad/s), reported a
                              (2 m/s^2), |reported delta| (0.2 rad), |lateral error| (0.1 m),
                              |heading error| (0.1 rad), speed error (1 m/s)
 preview               6      largest |curvature| in each quarter of the preview (0.05 1/m); speed in
-                             its middle and at its end, less that now (5 m/s)
+                             its middle and at its end, minus the reference speed (5 m/s)
 quick, slow           20     `watching.STATISTICS` over 0.4 s and over 4 s: ln(rms / scale) / 2, rms
                              of at least 3 % of the scale
 solver                2      mean iterations since the last decision (10), share of failed solves
@@ -33,19 +33,31 @@ from agents.weight_tuning.watching import (
     SLOW,
     STATISTICS,
 )
-from lpv_track_env.observation import PREVIEW_START
+from lpv_track_env.observation import (
+    ACCELERATION,
+    HEADING_ERROR,
+    LATERAL_ERROR,
+    LATERAL_SPEED,
+    LONGITUDINAL_SPEED,
+    PREVIEW_START,
+    REFERENCE_SPEED,
+    STEERING_ANGLE,
+    YAW_RATE,
+)
 from trajectories.compilation import compiled, compiled_internal
 
 Array = NDArray[Any]
 
 LIMIT = 5.0
+"""Bound of every feature."""
 TUNED = 8
-"""Weights that are chosen: Q and S; only ratios matter, so R stays."""
+"""Number of weights that are chosen: Q and S. Only ratios matter, so R is fixed."""
 QUARTERS = 4
+"""Number of parts of the preview with a feature each for their largest curvature."""
 SCALES = np.array([0.05, 0.05, 0.5, 0.02, 0.01, 0.02, 0.5, 0.2, 2.0, 0.2])
-"""Of the statistics, in their order and units."""
+"""Scales of the statistics, in their order and units."""
 LEAST = 1e-3
-"""Of a mean square over its scale's."""
+"""Offset added to mean squares, relative to the square of the scale: (3 % of the scale)^2."""
 
 SITUATION = (
     "longitudinal_speed", "lateral_speed", "yaw_rate", "acceleration", "steering_angle",
@@ -58,22 +70,42 @@ SHARED = (
     "iterations", "failures",
     *(f"weight_{matrix}_{state}" for matrix in "QS" for state in ("vx", "psi", "x", "y")),
 )  # fmt: skip
-"""Names of all entries but those of the bands."""
+"""Names of all features but those of the bands."""
+
+PATH = (*(f"curvature_{k}" for k in range(1, QUARTERS + 1)), "speed_middle", "speed_end",
+        "longitudinal_speed")  # fmt: skip
+"""Features of the path and the speed, without those of the bands."""
+DRIVE = (
+    *(f"{time}_{name}" for time in ("quick", "slow") for name in STATISTICS), "iterations",
+    "failures",
+)  # fmt: skip
+"""Features of the drive so far: noise, lag, weave, solver."""
+SUBSETS = ("all", "path", "drive")
+"""Names of the feature subsets that a learner may be restricted to."""
 
 
 def names(bands: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of all entries, for bands of such names."""
+    """List the names of all features, given those of the bands."""
     return (*SHARED, *(f"band_{name}" for name in bands))
 
 
 def size(bands: int) -> int:
-    """Number of entries."""
+    """Return the number of features for a number of bands."""
     return len(SHARED) + bands
+
+
+def subset_mask(subset: str, bands: tuple[str, ...]) -> NDArray[np.float32]:
+    """Return a factor per feature, (size,): 1 for those in one of `SUBSETS`, 0 for the others."""
+    if subset == "path":
+        kept = {*PATH, *(f"band_{name}" for name in bands)}
+    else:
+        kept = set(DRIVE if subset == "drive" else names(bands))
+    return np.array([float(name in kept) for name in names(bands)], dtype=np.float32)
 
 
 @compiled_internal
 def bounded(value: Any) -> Any:
-    """A value within the limits; what is no number becomes 0."""
+    """Clip a value to the limits; NaN becomes 0."""
     if math.isnan(value):
         return 0.0
     return min(max(value, -LIMIT), LIMIT)
@@ -83,20 +115,21 @@ def bounded(value: Any) -> Any:
 def fill_features(
     o: Array, w: Array, used: Array, base: Array, band: int, scales: Array, log_span: Any, x: Array
 ) -> None:
-    """Fill `x` (size,) for an observation `o` and its drive's `watching` row `w`.
+    """Fill the features `x` (size,) for an observation `o` and the row `w` of its drive's history.
 
-    `used` (10,) are the weights in use, of zeros before the first; `base` (bands, 10) those that
-    are multiplied; `band` may be -1.
+    `used` (10,) are the weights in use, zeros before the first choice; `base` (bands, 10) those
+    that an action multiplies; `band` may be -1.
     """
     steps = (o.shape[0] - PREVIEW_START) // 2
-    x[0] = bounded(o[0] / 10.0 - 1.0)
-    x[1] = bounded(abs(o[1]) / 0.5)
-    x[2] = bounded(abs(o[2]) / 0.3)
-    x[3] = bounded(o[3] / 2.0)
-    x[4] = bounded(abs(o[4]) / 0.2)
-    x[5] = bounded(abs(o[5]) / 0.1)
-    x[6] = bounded(abs(o[6]) / 0.1)
-    x[7] = bounded(o[0] - o[7])
+    # In the order of SITUATION.
+    x[0] = bounded(o[LONGITUDINAL_SPEED] / 10.0 - 1.0)
+    x[1] = bounded(abs(o[LATERAL_SPEED]) / 0.5)
+    x[2] = bounded(abs(o[YAW_RATE]) / 0.3)
+    x[3] = bounded(o[ACCELERATION] / 2.0)
+    x[4] = bounded(abs(o[STEERING_ANGLE]) / 0.2)
+    x[5] = bounded(abs(o[LATERAL_ERROR]) / 0.1)
+    x[6] = bounded(abs(o[HEADING_ERROR]) / 0.1)
+    x[7] = bounded(o[LONGITUDINAL_SPEED] - o[REFERENCE_SPEED])
     at = 8
     for quarter in range(QUARTERS):
         largest = 0.0
@@ -105,8 +138,8 @@ def fill_features(
         x[at] = bounded(largest / 0.05)
         at += 1
     speeds = PREVIEW_START + steps
-    x[at] = bounded((o[speeds + (steps - 1) // 2] - o[7]) / 5.0)
-    x[at + 1] = bounded((o[speeds + steps - 1] - o[7]) / 5.0)
+    x[at] = bounded((o[speeds + (steps - 1) // 2] - o[REFERENCE_SPEED]) / 5.0)
+    x[at + 1] = bounded((o[speeds + steps - 1] - o[REFERENCE_SPEED]) / 5.0)
     at += 2
     for means in (QUICK, SLOW):
         for j in range(COUNT):
@@ -131,7 +164,7 @@ def fill_all(
     observations: Array, watched: Array, used: Array, base: Array, bands: Array, scales: Array,
     log_span: Any, features: Array,
 ) -> None:  # fmt: skip
-    """`fill_features` for every row: `features` (n, size) float32."""
+    """Apply `fill_features` to every row of `features` (n, size) float32."""
     for row in range(observations.shape[0]):
         fill_features(
             observations[row], watched[row], used[row], base, bands[row], scales, log_span,

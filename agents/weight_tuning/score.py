@@ -1,17 +1,18 @@
-"""The score that weights are tuned for: tracking and comfort of a drive, of the truth.
+"""Score that weights are tuned for: tracking and comfort of a drive, lower is better.
 
-Lower is better. Each part is a root mean square over the drive by its scale::
+Each part is a root mean square over the drive, divided by its scale::
 
     tracking = rms(lateral error) / 0.05 m + rms(heading error) / 0.1 rad
                + rms(speed error) / 0.5 m/s
     comfort  = rms(steering rate) / 0.2 rad/s + rms(jerk) / 4 m/s^3
     score    = tracking + comfort
 
-of what the vehicle does, not of what is measured or commanded; a drive that leaves the road, turns
-around or breaks down scores `FAILED`. The scales are a choice, made before anything was tuned: an
-error of fixes and one of control of some 3.5 cm each; the sideslip lr kappa of the default vehicle
-in a bend of 17 m, which no weights can avoid; what the jerk limit costs at a start; two fifths of
-the steering's rate limit and four fifths of that of jerk.
+It is computed from the true motion of the vehicle, not from measurements or commands. A drive that
+leaves the road, turns around or breaks down scores `FAILED`. The scales were chosen before anything
+was tuned. Lateral error: 3.5 cm of error in the fixes with 3.5 cm of control error; heading error:
+the sideslip lr kappa of the default vehicle in a bend of 17 m, which no weights can avoid; speed
+error: the effect of the jerk limit at a start; steering rate and jerk: two fifths and four fifths of
+their limits.
 """
 
 from typing import Any
@@ -26,21 +27,21 @@ Array = NDArray[Any]
 
 PARTS = ("lateral", "heading", "speed", "steering_rate", "jerk")
 SCALES = np.array([0.05, 0.1, 0.5, 0.2, 4.0])
-"""m, rad, m/s, rad/s, m/s^3."""
+"""Scales of the parts, m, rad, m/s, rad/s, m/s^3."""
 TRACKING, COMFORT = slice(0, 3), slice(3, 5)
 FAILED = 25.0
+"""Score of a failed drive."""
 FAILURES = (k.LEFT_CORRIDOR, k.WRONG_HEADING, k.NON_FINITE)
-"""Codes of ends that fail a drive."""
-
+"""Codes of the ends with which a drive has failed."""
 
 USUAL = np.array([0.05, 0.03, 0.1, 0.08, 0.8])
-"""Root mean squares of usual drives, m, rad, m/s, rad/s, m/s^3: what a drive's own begin from."""
+"""Root mean squares of a typical drive, m, rad, m/s, rad/s, m/s^3."""
 USUAL_WINDOWS = 5
-"""Windows of usual driving that a drive's own root mean squares are made with."""
+"""Number of windows of typical driving with which the statistics of every drive begin."""
 
 
 def squares_of(tally: Tally) -> Array:
-    """Sums of squares of the five, (n, 5), in their own units."""
+    """Stack the sums of squares of the five parts, (n, 5), in their own units."""
     return np.stack(
         [
             tally.lateral_square,
@@ -54,21 +55,21 @@ def squares_of(tally: Tally) -> Array:
 
 
 def parts_of(tally: Tally) -> Array:
-    """The five parts of what was driven, (n, 5); 0 where nothing was."""
+    """Compute the five parts of the score, (n, 5); 0 before the first control period."""
     steps = np.maximum(tally.steps, 1.0)[:, None]
     parts: Array = np.sqrt(squares_of(tally) / steps) / SCALES
     return parts
 
 
 def rms_so_far(squares: Array, steps: Array, periods: int) -> Array:
-    """Root mean squares of drives, (n, 5), after `USUAL_WINDOWS` of usual driving.
+    """Compute root mean squares of drives, (n, 5), preceded by `USUAL_WINDOWS` of typical driving.
 
     Parameters
     ----------
     squares, steps
         Sums of squares (n, 5) over control periods (n,).
     periods
-        Control periods of a whole window.
+        Number of control periods in a whole window.
     """
     before = float(USUAL_WINDOWS * periods)
     rms: Array = np.sqrt((before * USUAL**2 + squares) / (before + steps[:, None]))
@@ -76,21 +77,21 @@ def rms_so_far(squares: Array, steps: Array, periods: int) -> Array:
 
 
 def marginal_parts(window: Tally, drive: Tally, periods: int) -> Array:
-    """What a window adds to the parts of its drive's score, (n, 5), a part to a usual window.
+    """Compute the contribution of a window to the parts of its drive's score, (n, 5).
 
-    A root mean square is no sum over windows; to first order around the drive's own rms rho,
+    A root mean square is not a sum over windows. To first order around the drive's rms rho,
 
         rms = mean over windows of (mean square / rho + rho) / 2
 
-    so that many windows' mean is the drive's part, and what makes it least is the same. rho is the
-    drive's so far, `drive` with this window, after `USUAL_WINDOWS` of usual driving.
+    so the mean over many windows approaches the drive's part and has the same minimiser. rho is the
+    rms of the drive up to the end of this window, preceded by `USUAL_WINDOWS` of typical driving.
 
     Parameters
     ----------
     window, drive
-        What was driven in the window, and in the drive up to its end.
+        Sums over the window, and over the drive up to its end.
     periods
-        Control periods of a whole window.
+        Number of control periods in a whole window.
     """
     steps = np.maximum(window.steps, 1.0)[:, None]
     rho = rms_so_far(squares_of(drive), drive.steps, periods)
@@ -99,11 +100,11 @@ def marginal_parts(window: Tally, drive: Tally, periods: int) -> Array:
 
 
 def failed(ends: Array) -> Array:
-    """Which drives have failed, by the codes of their ends, (n,) bool."""
+    """Return which drives have failed, given the codes of their ends, (n,) bool."""
     return np.isin(ends, FAILURES)
 
 
 def scores_of(tally: Tally, ends: Array) -> Array:
-    """Scores of whole drives, (n,)."""
+    """Compute the scores of whole drives, (n,)."""
     scores: Array = np.where(failed(ends), FAILED, parts_of(tally).sum(axis=1))
     return scores

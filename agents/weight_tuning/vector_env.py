@@ -11,11 +11,15 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 import agents
-from agents.weight_tuning.choice import WeightChoice
+from agents.weight_tuning.choice import (
+    WeightChoice,
+    action_space,
+    checked_actions,
+    observation_space,
+)
 from agents.weight_tuning.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.score import FAILED, failed, marginal_parts, parts_of, scores_of
-from agents.weight_tuning.spaces import action_space, checked_choices, observation_space
 from agents.weights import in_words
 from lpv_track_env import kernels as k
 from lpv_track_env.conditions import Conditions
@@ -143,7 +147,7 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
         """Drive on with the weights that are chosen, until the window or the band ends."""
         self._check_order()
-        self._choose(checked_choices(actions, self.choice, self.num_envs))
+        self._choose(checked_actions(actions, self.choice, self.num_envs))
         begins = self._ended
         tally = self.loop.drive(self._decider.window, self.loop.memory.tables, until_band=True)
         ends = self.drives.arrays.ends

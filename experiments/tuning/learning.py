@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 
+from agents.weight_tuning.features import subset_mask
 from agents.weight_tuning.learner import WeightLearnerVecEnv
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.vector_env import WeightTuningVectorEnv
-from agents.weight_tuning.views import seen_in
 from experiments.training import checkpoint
 from experiments.tuning.choices import choice_of
 from experiments.tuning.drives import first_seed, threads
@@ -42,7 +42,7 @@ class PolicyLearning(Tuner):
             time_limit=settings.time_limit, random_start=True, autoreset_mode="SameStep",
             threads=threads(),
         )  # fmt: skip
-        self.env = WeightLearnerVecEnv(envs, seen_in(settings.view, self.choice.bands.names))
+        self.env = WeightLearnerVecEnv(envs, subset_mask(settings.view, self.choice.bands.names))
         self._before, self._segment = 0, 0
         hyper = self.hyper
         self.model = PPO(

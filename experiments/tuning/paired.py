@@ -19,9 +19,9 @@ import agents
 from agents.weight_tuning import features
 from agents.weight_tuning.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.deciding import Decider
+from agents.weight_tuning.features import subset_mask
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import FAILED, SCALES, failed, rms_so_far, scores_of, squares_of
-from agents.weight_tuning.views import seen_in
 from experiments.tuning.choices import choice_of
 from experiments.tuning.drives import Array, environments, first_seed, threads
 from experiments.tuning.quadratic import PairedQuadratic, Prior
@@ -55,7 +55,7 @@ class PairedLearning(Tuner):
         names = features.names(self.choice.bands.names)
         # The weights in use are what was chosen: to be told them would be to be told u twice.
         own = np.array([not name.startswith("weight_") for name in names])
-        self.seen: Array = seen_in(settings.view, self.choice.bands.names) * own
+        self.seen: Array = subset_mask(settings.view, self.choice.bands.names) * own
         self.pairs = settings.drives // 2
         windows = max(settings.periods // self._decider.window, 1)
         self.hold = min(int(hyper["hold"]), windows)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.weight_tuning.choice import DIRECTIONS
-from agents.weight_tuning.views import VIEWS
+from agents.weight_tuning.features import SUBSETS
 from experiments.run.suites import HELD_OUT, SIX
 from experiments.training.hyperparameters import LEAST, MOST
 from experiments.training.settings import MOST_PATHS
@@ -97,7 +97,7 @@ class TuningSettings:
     def __post_init__(self) -> None:
         choose("method", self.method, tuple(METHODS))
         choose("directions", self.directions, tuple(DIRECTIONS))
-        choose("view", self.view, tuple(VIEWS))
+        choose("view", self.view, SUBSETS)
         known = HYPERPARAMETERS[self.method]
         for key, value in self.hyperparameters.items():
             choose(f"hyperparameter of {self.method}", key, tuple(known))
