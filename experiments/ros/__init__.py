@@ -1,7 +1,7 @@
-"""ROS bags: export of a run, import, a reference path from a recorded drive, replay.
+"""ROS bags: export of a run, reference path from a recorded drive, replay.
 
-`topics` has what is exchanged as plain arrays, `messages` its ROS messages, `write` and `read` the
-files (ROS 1 and ROS 2, through `rosbags`, which needs no ROS), `runs` makes topics of a run,
-`sensors` adds errors, `reference` makes a path of a drive, `recording` and `replay` feed recorded
-sensors to the estimator and an agent, `comparison` reports on it.
+`topics` holds plain arrays, `messages` converts them to ROS messages, `write` and `read` handle the
+files (ROS 1 and ROS 2, through `rosbags`, without ROS). `runs` makes the topics of a simulated run,
+`reference` makes a path from a drive, `replay` feeds recorded sensors to the estimator and an
+agent, and `comparison` compares the result with the recording.
 """

@@ -1,4 +1,4 @@
-"""A replay against what was recorded: figures for a table and JSON, and a drawing."""
+"""Comparison of a replay with the recording: statistics, a table and a figure."""
 
 from pathlib import Path
 from typing import Any, cast
@@ -18,7 +18,7 @@ from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 Array = NDArray[np.float64]
 
 LIMIT_95 = 5.991
-"""95 % of chi-square with 2 degrees of freedom: a fix's NIS stays below."""
+"""95 % quantile of chi-square with 2 degrees of freedom, for the NIS of fixes."""
 RECORDED, REPLAYED, THIRD = COLOURS[0], COLOURS[1], COLOURS[2]
 PATH: dict[str, Any] = {"color": "#000000", "alpha": 0.25, "linewidth": 4.0, "label": "path"}
 ERRORS = (
@@ -31,7 +31,7 @@ ERRORS = (
 
 
 def differences(replay: Replay) -> dict[str, Array]:
-    """Estimate less odometry by name, and proposed less recorded commands; NaN where none is."""
+    """Return estimate - odometry and proposed - recorded commands by name, (n,); may be NaN."""
     found: dict[str, Array] = {}
     if replay.odometry is not None:
         apart = replay.estimate - replay.odometry
@@ -46,10 +46,10 @@ def differences(replay: Replay) -> dict[str, Array]:
 
 
 def summary(replay: Replay) -> dict[str, Any]:
-    """Plain values for JSON: errors' rms and largest magnitudes, NIS, counts, remarks.
+    """Return plain values for JSON: rms and largest errors, NIS, counts, remarks.
 
-    `errors` compares the estimate with odometry and is empty without it. A figure that there is
-    nothing to make of is None.
+    `errors` compares the estimate with odometry and is empty without it. A statistic without data
+    is None.
     """
     found = {name: _magnitudes(values) for name, values in differences(replay).items()}
     used = replay.fix_nis[replay.fix_used]
@@ -77,6 +77,7 @@ def summary(replay: Replay) -> dict[str, Any]:
 
 
 def _magnitudes(values: Array) -> dict[str, float | None]:
+    """Return rms and largest magnitude of the finite values."""
     known = values[np.isfinite(values)]
     if not len(known):
         return {"rms": None, "max": None}
@@ -84,7 +85,7 @@ def _magnitudes(values: Array) -> dict[str, float | None]:
 
 
 def table(found: dict[str, Any]) -> Table:
-    """What a summary says, for the console."""
+    """Return a summary as a table for the console."""
     result = Table(title="replay against recording")
     for heading in ("", "rms", "largest", "unit"):
         result.add_column(heading, justify="left" if heading in {"", "unit"} else "right")
@@ -113,7 +114,7 @@ def _row(result: Table, words: str, values: dict[str, float | None], unit: str) 
 
 
 def draw(replay: Replay, file: Path) -> None:
-    """Draw a replay as PNG: the plan, the estimate's error, both commands, the fixes' NIS."""
+    """Write the figure: plan, error of the estimate, both commands, NIS of the fixes."""
     with mpl.rc_context(cast("Any", STYLE)):
         figure = Figure(figsize=(12.0, 7.5), layout="constrained")
         grid = figure.add_gridspec(4, 2)

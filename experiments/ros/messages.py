@@ -1,8 +1,8 @@
-"""Topics as ROS messages and back.
+"""Conversion of topics to ROS messages and back.
 
-Messages are laid out by definitions that stand here and in `rosbags`, never by those that a bag
-carries: nothing that a file says is turned into code. A bag whose definition of a type differs (by
-its hash) is refused.
+The layouts of messages come from the definitions in this file and in `rosbags`, never from those
+that a bag carries, so that nothing in a file is turned into code. A bag whose definition of a type
+differs (by its hash) is refused.
 """
 
 import math
@@ -35,7 +35,7 @@ NAN = math.nan
 
 _SEPARATOR = "=" * 80 + "\n"
 DEFINITIONS = {
-    # Checksums: 1fd5d7f5... and ea50d268... in ROS 1, as in the packages that ROS ships.
+    # Their ROS 1 checksums, 1fd5d7f5... and ea50d268..., are those of the packages in ROS.
     "ackermann_msgs/msg/AckermannDriveStamped": (
         "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
         f"{_SEPARATOR}MSG: ackermann_msgs/AckermannDrive\n"
@@ -48,16 +48,16 @@ DEFINITIONS = {
         "float64 latitude\nfloat64 longitude\nfloat64 altitude\n"
     ),
 }
-"""Definitions of the types that `rosbags` does not have."""
+"""Definitions of the message types that `rosbags` lacks."""
 
 
 def require_rosbags() -> None:
-    """Check that bags can be read and written at all.
+    """Check that bags can be read and written.
 
     Raises
     ------
     ModuleNotFoundError
-        If `rosbags` is not installed, with what installs it.
+        If `rosbags` is not installed, with the command that installs it.
     """
     try:
         import rosbags.typesys  # noqa: F401
@@ -69,7 +69,7 @@ def require_rosbags() -> None:
 
 @cache
 def typestore(ros: int) -> "Typestore":
-    """Types of ROS 1 (Noetic) or ROS 2, whose distributions agree on all that is used here."""
+    """Return the types of ROS 1 (Noetic) or ROS 2; its distributions agree on those used here."""
     require_rosbags()
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -87,34 +87,34 @@ class Maker:
         self.types: Any = typestore(ros).types
 
     def __call__(self, name: str, *values: Any) -> Any:
-        """Message `package/Type` of its fields in order."""
+        """Make a message `package/Type` from its fields in order."""
         package, _, kind = name.partition("/")
         return self.types[f"{package}/msg/{kind}"](*values)
 
     def header(self, stamp: int, frame: str, number: int) -> Any:
-        """std_msgs/Header; ROS 1 counts messages in it."""
+        """Make a std_msgs/Header; in ROS 1 it carries the message's number."""
         time = self("builtin_interfaces/Time", stamp // SECOND, stamp % SECOND)
         count = (number,) if self.ros == ROS1 else ()
         return self("std_msgs/Header", *count, time, frame)
 
     def vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
-        """geometry_msgs/Vector3."""
+        """Make a geometry_msgs/Vector3."""
         return self("geometry_msgs/Vector3", x, y, z)
 
     def turned(self, heading: float) -> Any:
-        """geometry_msgs/Quaternion of a heading on level ground."""
+        """Make the geometry_msgs/Quaternion of a heading on level ground."""
         half = 0.5 * heading
         return self("geometry_msgs/Quaternion", 0.0, 0.0, math.sin(half), math.cos(half))
 
 
 def stamp_of(message: Any) -> int:
-    """Header stamp, ns."""
+    """Return the header stamp, ns."""
     stamp = message.header.stamp
     return int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
 def heading_of(quaternion: Any) -> float:
-    """Yaw, rad in (-pi, pi], of a quaternion of any length but 0, which is NaN: it was not set."""
+    """Return the yaw, rad in (-pi, pi], of a quaternion of any length; NaN if all zeros (unset)."""
     x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     if not x * x + y * y + z * z + w * w > 0.0:
         return NAN
@@ -122,15 +122,15 @@ def heading_of(quaternion: Any) -> float:
 
 
 def covariance(size: int, *entries: tuple[int, float | None]) -> Array:
-    """Covariance (size^2,) with (place on the diagonal, deviation); None and the rest are 0."""
+    """Return a covariance (size^2,) from (index on the diagonal, deviation); None gives 0."""
     values = np.zeros(size * size)
-    for place, deviation in entries:
-        values[place * (size + 1)] = 0.0 if deviation is None else deviation**2
+    for index, deviation in entries:
+        values[index * (size + 1)] = 0.0 if deviation is None else deviation**2
     return values
 
 
 def unmeasured(value: float, known: Array) -> Array:
-    """Covariance (9,) of a part of an Imu message: element 0 is -1 where there is no value."""
+    """Return the covariance (9,) of a part of an Imu message; element 0 is -1 if value is NaN."""
     if not math.isnan(value):
         return known
     values = np.zeros(9)
@@ -139,25 +139,25 @@ def unmeasured(value: float, known: Array) -> Array:
 
 
 def _zeros(value: float) -> float:
+    """Replace NaN by 0."""
     return 0.0 if math.isnan(value) else value
 
 
-def _odometry(make: Maker, topic: Odometry) -> Iterator[Any]:
+def _odometry(make: Maker, topic: Odometry) -> Iterator[Sequence[Any]]:
     place = topic.position_deviation
-    # On the plane: z, roll and pitch are 0, and so is what the covariance says of them.
+    # On the plane z, roll and pitch are 0, and so are their covariances.
     pose_known = covariance(6, (0, place), (1, place), (5, topic.heading_deviation))
     speed = topic.speed_deviation
     twist_known = covariance(6, (0, speed), (1, speed), (5, topic.yaw_rate_deviation))
-    for k, stamp in enumerate(topic.stamp.tolist()):
-        position = make("geometry_msgs/Point", float(topic.x[k]), float(topic.y[k]), 0.0)
-        pose = make("geometry_msgs/Pose", position, make.turned(float(topic.heading[k])))
-        linear = make.vector(float(topic.longitudinal_speed[k]), float(topic.lateral_speed[k]))
-        twist = make("geometry_msgs/Twist", linear, make.vector(z=float(topic.yaw_rate[k])))
-        yield make(
-            "nav_msgs/Odometry", make.header(stamp, topic.frame, k), BASE_LINK,
+    for x, y, heading, vx, vy, yaw_rate in topic.rows():
+        position = make("geometry_msgs/Point", x, y, 0.0)
+        pose = make("geometry_msgs/Pose", position, make.turned(heading))
+        twist = make("geometry_msgs/Twist", make.vector(vx, vy), make.vector(z=yaw_rate))
+        yield (
+            BASE_LINK,
             make("geometry_msgs/PoseWithCovariance", pose, pose_known),
             make("geometry_msgs/TwistWithCovariance", twist, twist_known),
-        )  # fmt: skip
+        )
 
 
 def _odometry_row(message: Any) -> tuple[float, ...]:
@@ -170,19 +170,13 @@ def _odometry_row(message: Any) -> tuple[float, ...]:
     )  # fmt: skip
 
 
-def _imu(make: Maker, topic: Imu) -> Iterator[Any]:
+def _imu(make: Maker, topic: Imu) -> Iterator[Sequence[Any]]:
     heading_known = covariance(3, (2, topic.heading_deviation))
     rate_known = covariance(3, (2, topic.yaw_rate_deviation))
-    felt = topic.acceleration_deviation
-    force_known = covariance(3, (0, felt), (1, felt), (2, felt))
-    forces = np.column_stack(
-        [topic.forward_acceleration, topic.leftward_acceleration, topic.upward_acceleration]
-    )
-    for k, stamp in enumerate(topic.stamp.tolist()):
-        heading, rate = float(topic.heading[k]), float(topic.yaw_rate[k])
-        force = forces[k].tolist()
-        yield make(
-            "sensor_msgs/Imu", make.header(stamp, topic.frame, k),
+    deviation = topic.acceleration_deviation
+    force_known = covariance(3, (0, deviation), (1, deviation), (2, deviation))
+    for heading, rate, *force in topic.rows():
+        yield (
             make.turned(_zeros(heading)), unmeasured(heading, heading_known),
             make.vector(z=_zeros(rate)), unmeasured(rate, rate_known),
             make.vector(*map(_zeros, force)), unmeasured(sum(force), force_known),
@@ -203,14 +197,11 @@ def _imu_row(message: Any) -> tuple[float, ...]:
     )  # fmt: skip
 
 
-def _wheel_speed(make: Maker, topic: WheelSpeed) -> Iterator[Any]:
+def _wheel_speed(make: Maker, topic: WheelSpeed) -> Iterator[Sequence[Any]]:
     known = covariance(6, (0, topic.speed_deviation))
-    for k, stamp in enumerate(topic.stamp.tolist()):
-        twist = make("geometry_msgs/Twist", make.vector(float(topic.speed[k])), make.vector())
-        yield make(
-            "geometry_msgs/TwistWithCovarianceStamped", make.header(stamp, topic.frame, k),
-            make("geometry_msgs/TwistWithCovariance", twist, known),
-        )  # fmt: skip
+    for (speed,) in topic.rows():
+        twist = make("geometry_msgs/Twist", make.vector(speed), make.vector())
+        yield (make("geometry_msgs/TwistWithCovariance", twist, known),)
 
 
 def _wheel_speed_row(message: Any) -> tuple[float, ...]:
@@ -219,17 +210,13 @@ def _wheel_speed_row(message: Any) -> tuple[float, ...]:
     return twist.linear.x, message.twist.covariance[0] if with_covariance else 0.0
 
 
-def _fixes(make: Maker, topic: Fixes) -> Iterator[Any]:
+def _fixes(make: Maker, topic: Fixes) -> Iterator[Sequence[Any]]:
     status = make("sensor_msgs/NavSatStatus", 0, 1)  # STATUS_FIX, SERVICE_GPS
     place = topic.position_deviation
     known = covariance(3, (0, place), (1, place), (2, place))
     kind = 0 if place is None else 1  # COVARIANCE_TYPE_UNKNOWN or _APPROXIMATED: height is a guess
-    for k, stamp in enumerate(topic.stamp.tolist()):
-        yield make(
-            "sensor_msgs/NavSatFix", make.header(stamp, topic.frame, k), status,
-            float(topic.latitude[k]), float(topic.longitude[k]), float(topic.height[k]),
-            known, kind,
-        )  # fmt: skip
+    for position in topic.rows():
+        yield (status, *position, known, kind)
 
 
 def _fixes_row(message: Any) -> tuple[float, ...]:
@@ -243,29 +230,19 @@ def _fixes_row(message: Any) -> tuple[float, ...]:
     )
 
 
-def _commands(make: Maker, topic: Commands) -> Iterator[Any]:
-    for k, stamp in enumerate(topic.stamp.tolist()):
+def _commands(make: Maker, topic: Commands) -> Iterator[Sequence[Any]]:
+    for acceleration, angle, speed in topic.rows():
         # Rates of 0 mean: as quickly as possible.
-        drive = make(
-            "ackermann_msgs/AckermannDrive", float(topic.steering_angle[k]), 0.0,
-            float(topic.speed[k]), float(topic.acceleration[k]), 0.0,
-        )  # fmt: skip
-        yield make(
-            "ackermann_msgs/AckermannDriveStamped", make.header(stamp, topic.frame, k), drive
-        )
+        yield (make("ackermann_msgs/AckermannDrive", angle, 0.0, speed, acceleration, 0.0),)
 
 
 def _commands_row(message: Any) -> tuple[float, ...]:
     return message.drive.acceleration, message.drive.steering_angle, message.drive.speed
 
 
-def _datum(make: Maker, topic: Datum) -> Iterator[Any]:
-    for k, stamp in enumerate(topic.stamp.tolist()):
-        point = make(
-            "geographic_msgs/GeoPoint", float(topic.latitude[k]), float(topic.longitude[k]),
-            float(topic.height[k]),
-        )  # fmt: skip
-        yield make("geographic_msgs/GeoPointStamped", make.header(stamp, topic.frame, k), point)
+def _datum(make: Maker, topic: Datum) -> Iterator[Sequence[Any]]:
+    for position in topic.rows():
+        yield (make("geographic_msgs/GeoPoint", *position),)
 
 
 def _datum_row(message: Any) -> tuple[float, ...]:
@@ -273,14 +250,14 @@ def _datum_row(message: Any) -> tuple[float, ...]:
 
 
 class Codec(NamedTuple):
-    """How a kind of topic is written and read."""
+    """Conversion of one kind of topic to messages and back."""
 
     message_types: tuple[str, ...]
-    """Types that are read; the first is written."""
-    messages: Callable[[Maker, Any], Iterator[Any]]
-    """Messages of a topic, in order."""
+    """Types that can be read; the first is the one to write."""
+    fields: Callable[[Maker, Any], Iterator[Sequence[Any]]]
+    """Yields each message's fields after the header."""
     row: Callable[[Any], Sequence[float]]
-    """A message's values: the topic's columns, then the variances of `deviations`."""
+    """Returns a message's values: the topic's columns, then the variances of `deviations`."""
     deviations: tuple[str, ...] = ()
 
 
@@ -304,16 +281,18 @@ CODECS: dict[type[Topic], Codec] = {
 
 
 def serialise(ros: int, topic: Topic) -> Iterator[tuple[int, bytes]]:
-    """Stamps (ns) and bytes of a topic's messages, in order."""
-    store, codec = typestore(ros), CODECS[type(topic)]
+    """Yield stamp (ns) and bytes of each of a topic's messages, in order."""
+    store, codec, make = typestore(ros), CODECS[type(topic)], Maker(ros)
     to_bytes = store.serialize_ros1 if ros == ROS1 else store.serialize_cdr
-    messages = codec.messages(Maker(ros), topic)
-    for stamp, message in zip(topic.stamp.tolist(), messages, strict=True):
-        yield stamp, bytes(to_bytes(message, codec.message_types[0]))
+    name = codec.message_types[0]
+    messages = zip(topic.stamp.tolist(), codec.fields(make, topic), strict=True)
+    for number, (stamp, fields) in enumerate(messages):
+        message = make.types[name](make.header(stamp, topic.frame, number), *fields)
+        yield stamp, bytes(to_bytes(message, name))
 
 
 def digest_of(ros: int, message_type: str) -> str:
-    """Hash of a type's layout, as ROS 1 (MD5) or ROS 2 (RIHS01) has it."""
+    """Return the hash of a type's layout: MD5 in ROS 1, RIHS01 in ROS 2."""
     store = typestore(ros)
     if ros == ROS1:
         return store.generate_msgdef(message_type)[1]

@@ -1,4 +1,4 @@
-"""Read bags, ROS 1 and ROS 2, from wherever they come, into plain arrays."""
+"""Read ROS 1 and ROS 2 bags of any origin into plain arrays."""
 
 import math
 from collections.abc import Iterator
@@ -29,14 +29,14 @@ MAGIC = {
     b"\x89MCAP0\r\n": (ROS2, "mcap"),
     b"SQLite format 3\0": (ROS2, "sqlite3"),
 }
-"""First bytes of the files that bags consist of."""
+"""ROS version and storage by the first bytes of a file."""
 SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
 
 
 class BagError(ValueError):
-    """A bag that is no use for what is asked, said in one line.
+    """Bag that cannot be used for the purpose, with the reason in one line.
 
-    What a message quotes of a file may be anything; what does not print becomes a space.
+    Text that is quoted from a file may be anything; unprintable characters become spaces.
     """
 
     def __init__(self, message: str) -> None:
@@ -44,13 +44,13 @@ class BagError(ValueError):
 
 
 def printable(text: str) -> str:
-    """Text without line ends and what steers a terminal."""
+    """Replace line ends and control characters by spaces."""
     return "".join(character if character.isprintable() else " " for character in text)
 
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """A topic as a bag's index has it."""
+    """Topic in a bag's index."""
 
     name: str
     message_type: str
@@ -59,7 +59,7 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class BagInfo:
-    """What a bag's index says."""
+    """Index of a bag."""
 
     file: Path
     ros: int
@@ -68,11 +68,11 @@ class BagInfo:
     """bag, sqlite3 or mcap."""
     start: int
     end: int
-    """ns, times of receipt of the first and the last message; both 0 if there are none."""
+    """Times of receipt of the first and last message, ns; both 0 if there are none."""
     topics: tuple[TopicInfo, ...]
 
     def of_kind(self, kind: type[Topic]) -> list[str]:
-        """Names of the topics that hold messages of a kind."""
+        """Return the names of the topics with messages of a kind."""
         types = CODECS[kind].message_types
         return [
             topic.name for topic in self.topics if topic.message_type in types and topic.messages
@@ -81,17 +81,17 @@ class BagInfo:
 
 @dataclass(frozen=True)
 class Reading(Generic[T]):
-    """A topic's arrays in the order of their stamps, and what was wrong with its messages."""
+    """Arrays of a topic in the order of their stamps, and counts of its faulty messages."""
 
     topic: str
     data: T
     messages: int
     out_of_order: int
-    """Messages with a stamp before that of one logged earlier; sorted."""
+    """Messages with an earlier stamp than a message logged before them; sorted."""
     duplicates: int
-    """Messages with the stamp of one logged earlier; dropped."""
+    """Messages with the same stamp as a message logged before them; dropped."""
     unusable: int
-    """Messages without a stamp (0), without a fix, or with a value that is no number; dropped."""
+    """Messages without a stamp (0), without a fix, or with a value that is not finite; dropped."""
 
 
 def info(file: Path) -> BagInfo:
@@ -100,7 +100,7 @@ def info(file: Path) -> BagInfo:
     Raises
     ------
     BagError
-        In one line, if it is no bag, or torn.
+        If the file is not a bag, or truncated.
     ModuleNotFoundError
         If `rosbags` is not installed.
     """
@@ -118,13 +118,13 @@ def read(file: Path, kind: type[T], topic: str | None = None) -> Reading[T]:
     kind
         `Odometry`, `Imu`, `WheelSpeed`, `Fixes`, `Commands` or `Datum`.
     topic
-        Its name; if None, the only topic with messages of that kind.
+        Its name; by default the only topic with messages of that kind.
 
     Raises
     ------
     BagError
-        In one line: no bag, or torn; no such topic, or several to choose from, which are listed; a
-        message type of another layout; no usable message; a frame that changes on the way.
+        If the file is not a bag, or truncated; if there is no such topic, or several, which are
+        listed; if a message type has another layout, no message is usable, or the frame changes.
     ModuleNotFoundError
         If `rosbags` is not installed.
     """
@@ -157,7 +157,7 @@ def _tidied(
     rows: Array,
     frames: set[str],
 ) -> Reading[T]:
-    """Arrays of messages in the order of logging: sorted, without duplicates and unusable ones."""
+    """Return messages in the order of logging as arrays: sorted, usable, without duplicates."""
     columns, codec = kind.columns(), CODECS[kind]
     messages = len(stamps)
     rows = rows.reshape(messages, len(columns) + len(codec.deviations))
@@ -192,7 +192,7 @@ def _tidied(
 
 
 def _unwrapped(heading: Array) -> Array:
-    """Headings without jumps of whole turns; NaN stays."""
+    """Return headings without jumps of whole turns; NaN stays NaN."""
     unwrapped = heading.copy()
     known = ~np.isnan(heading)
     unwrapped[known] = np.unwrap(heading[known])
@@ -200,13 +200,13 @@ def _unwrapped(heading: Array) -> Array:
 
 
 def _deviation(variance: Array) -> float | None:
-    """Usual standard deviation of what says that it knows; zeros and negative ones do not."""
-    told = variance[np.isfinite(variance) & (variance > 0.0)]
-    return math.sqrt(float(np.median(told))) if len(told) else None
+    """Return the square root of the median positive variance, or None if there is none."""
+    known = variance[np.isfinite(variance) & (variance > 0.0)]
+    return math.sqrt(float(np.median(known))) if len(known) else None
 
 
 def _choose(bag: BagInfo, kind: type[Topic], topic: str | None) -> str:
-    """Name of the topic of a kind that is meant."""
+    """Return the topic of a kind: the named one, else the only one."""
     found = bag.of_kind(kind)
     listed = ", ".join(found) if found else "none"
     types = " or ".join(CODECS[kind].message_types).replace("/msg/", "/")
@@ -228,7 +228,7 @@ def _choose(bag: BagInfo, kind: type[Topic], topic: str | None) -> str:
 
 
 def _check_layout(file: Path, connection: Any, ros: int) -> None:
-    """Refuse messages that are laid out otherwise than this project's definitions say."""
+    """Refuse messages whose layout differs from this project's definition."""
     expected = digest_of(ros, connection.msgtype)
     if connection.digest not in {"", "*", expected}:
         raise BagError(
@@ -238,6 +238,7 @@ def _check_layout(file: Path, connection: Any, ros: int) -> None:
 
 
 def _info(file: Path, reader: Any, ros: int, storage: str) -> BagInfo:
+    """Return the index of an opened bag."""
     topics = sorted(
         (str(name), str(connection.msgtype), int(connection.msgcount))
         for name, topic in reader.topics.items()
@@ -256,10 +257,10 @@ def _info(file: Path, reader: Any, ros: int, storage: str) -> BagInfo:
 
 @contextmanager
 def _opened(file: Path) -> Iterator[tuple[Any, int, str]]:
-    """A bag's reader, ROS version and storage; whatever goes wrong within is a BagError.
+    """Open a bag as (reader, ROS version, storage); any error inside becomes a BagError.
 
-    A torn or foreign file makes its parser fail in ways without end (struct, sqlite, YAML,
-    assertions, ...), and the file is the cause of all of them.
+    A truncated or foreign file makes parsers fail in many ways (struct, sqlite, YAML, assertions,
+    ...), all of which the file causes.
     """
     require_rosbags()
     ros, storage = _recognise(file)
@@ -283,7 +284,7 @@ def _opened(file: Path) -> Iterator[tuple[Any, int, str]]:
 
 
 def _recognise(file: Path) -> tuple[int, str]:
-    """ROS version and storage of a bag, by its content."""
+    """Return ROS version and storage of a bag, by its content."""
     if file.is_dir():
         if not (file / "metadata.yaml").is_file():
             raise BagError(f"{file} is no ROS 2 bag: there is no metadata.yaml in the folder")

@@ -1,9 +1,9 @@
-"""A reference path from a recorded drive: positions of odometry or of fixes, smoothed.
+"""Reference path from a recorded drive: smoothed positions of odometry or of fixes.
 
-Smoothing splines over time take the noise out of x and y, as much as generalised cross-validation
-finds (Craven and Wahba, 1979) or to a given tolerance. What they pass is resampled by distance, so
-standstill falls away, and becomes a path at 0.25 m of arc length with heading and curvature from a
-spline's derivatives. The speed is the recorded one, the splines' own, or planned anew.
+Smoothing splines over time remove noise from x and y, by generalised cross-validation (Craven and
+Wahba, 1979) or to a given tolerance. The splines are resampled by distance, which removes
+standstill, and become a path at 0.25 m of arc length, with heading and curvature from a spline's
+derivatives. The speed is that of the smoothing splines, or planned anew.
 """
 
 import math
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_smoothing_spline
 
 from experiments.ros.read import BagError, Reading, info, read
-from experiments.ros.topics import Datum, Fixes, Odometry
+from experiments.ros.topics import Datum, Fixes, GeoPoint, Odometry
 from trajectories.importers import IMPORT_LIMITS, MAX_STEERING_ANGLE, self_approach
 from trajectories.path import ReferencePath
 from trajectories.shapes import Geometry, from_geometry, smooth
@@ -25,36 +25,37 @@ from trajectories.speed import SpeedLimits
 Array = NDArray[np.float64]
 
 BIN = 0.1
-"""s: positions nearer in time are averaged first; cross-validation takes a millisecond for each."""
+"""Bin width for averaging positions before smoothing, s; validation takes 1 ms per position."""
 SPACING = 0.5
-"""m between the points that are left: standstill leaves one."""
+"""Distance between resampled points, m; standstill leaves one point."""
 SHAPE_TOLERANCE, SHAPE_SHARE = 3e-4, 0.05
-"""m, and as a share of the noise: rms by which the path may pass the smoothed points. More noise
-leaves ripples that bend a path of interpolating splines by up to 0.1 1/m (5 cm, 10 Hz)."""
+"""Allowed rms distance of the path from the smoothed points: m, and as a share of the noise. An
+interpolating path would keep ripples of up to 0.1 1/m in curvature (noise of 5 cm, 10 Hz)."""
 LEAST_SPEED = 0.5
-"""m/s to which a recorded speed is raised: a reference never stands still."""
+"""Lower bound on a reference's speed, m/s."""
 OUTLIER, LEAST_OUTLIER = 6.0, 0.1
+"""Positions are outliers if farther off than this many standard deviations, and this many m."""
 OUTLIER_ROUNDS = 8
-"""Positions further off than so many deviations of the noise, and than so many m, are left out, and
-the rest is smoothed again, which may show more of them."""
+"""Largest number of rounds of leaving out outliers and smoothing again."""
 FEWEST_POSITIONS, SHORTEST = 8, 5.0
+"""Smallest number of positions, and smallest length, m, of a path."""
 LONGEST_GAP = 2.0
-"""s without a position, beyond which there is a warning."""
+"""Longest time without a position before a warning, s."""
 PENALTIES = (-12.0, 8.0)
 PENALTY_RESOLUTION = 0.05
-"""Powers of ten between which a penalty is bisected, and to what resolution."""
+"""Range and resolution of the bisection for a smoothing penalty, in powers of ten."""
 
 
 @dataclass(frozen=True)
 class DrivenLine:
-    """A drive's path, and what became of its positions."""
+    """Path of a drive, and statistics of its positions."""
 
     path: ReferencePath
     topic: str
     positions: int
     deviation_rms: float
     deviation_max: float
-    """m, distances of the recorded positions from where the splines are at their time."""
+    """Distances of the recorded positions from the splines at the same time, m."""
     warnings: list[str] = field(default_factory=list)
 
 
@@ -63,7 +64,7 @@ def reference(
     *,
     source: str | None = None,
     topic: str | None = None,
-    datum: tuple[float, float, float] | None = None,
+    datum: GeoPoint | None = None,
     smoothing: float | None = None,
     limits: SpeedLimits | None = None,
     name: str | None = None,
@@ -75,23 +76,23 @@ def reference(
     file
         The bag.
     source
-        "odometry" or "fix"; if None, odometry if there is any.
+        "odometry" or "fix"; by default odometry if there is any.
     topic
-        The topic's name, where the bag has several of the kind.
+        The topic's name, required if the bag has several of the kind.
     datum
-        Of fixes: latitude, longitude (deg) and height (m) of x = y = 0; if None, the bag's own
-        (geographic_msgs/GeoPointStamped), else the first fix.
+        Origin for fixes; by default the bag's own (geographic_msgs/GeoPointStamped), else the first
+        fix.
     smoothing
-        m, rms distance of the positions from the smoothed ones; found by cross-validation if None.
+        Rms distance of the positions from the smoothed ones, m; by default cross-validated.
     limits
-        Plan the speed within these; if None, the recorded speed is kept, from 0.5 m/s upwards.
+        Limits of a planned speed; by default the recorded speed, at least 0.5 m/s.
     name
-        The path's name; the bag's unless given.
+        The path's name, by default the bag's.
 
     Raises
     ------
     BagError
-        If the bag cannot be read, or its drive is no path: too short, or turning back.
+        If the bag cannot be read, or its drive is too short or turns back.
     ValueError
         For a tolerance that is not positive.
     """
@@ -122,8 +123,8 @@ def reference(
         raise BagError(f"{file}: {reading.topic}: {error}") from error
 
 
-def datum_of(file: Path, fixes: Fixes) -> tuple[float, float, float]:
-    """Where x = y = 0 of a bag lies (deg, deg, m): as it says itself, else at the first fix."""
+def datum_of(file: Path, fixes: Fixes) -> GeoPoint:
+    """Return the datum in a bag, else its first fix."""
     if info(file).of_kind(Datum):
         return read(file, Datum).data.last
     height = float(fixes.height[0])
@@ -133,7 +134,7 @@ def datum_of(file: Path, fixes: Fixes) -> tuple[float, float, float]:
 
 
 class _NoPathError(ValueError):
-    """Positions that make no path."""
+    """Positions that cannot become a path."""
 
 
 def _line(
@@ -144,30 +145,31 @@ def _line(
     name: str,
     metadata: dict[str, Any],
 ) -> DrivenLine:
-    told: list[str] = []
+    """Make a path of positions (n, 2) and complete its metadata."""
+    warnings: list[str] = []
     time, means = _averaged(reading.data.time, points)
     if len(time) < FEWEST_POSITIONS:
         raise _NoPathError(f"{len(time)} positions over time, {FEWEST_POSITIONS} are needed")
     gap = int(np.argmax(np.diff(time)))
     if time[gap + 1] - time[gap] > LONGEST_GAP:
-        told.append(
+        warnings.append(
             f"no positions for {time[gap + 1] - time[gap]:.1f} s from {time[gap]:.1f} s on: bridged"
         )
-    centre = means.mean(axis=0)  # coordinates of a map's grid would cost digits
+    centre = means.mean(axis=0)  # coordinates in a map's grid are large and would lose digits
     means -= centre
     splines, kept = _robust(time, means, smoothing)
     if not kept.all():
-        told.append(f"{int((~kept).sum())} positions lie far off the others: left out")
+        warnings.append(f"{int((~kept).sum())} positions lie far off the others: left out")
     distance = _distances(splines, time[kept], means[kept])
     noise = float(np.sqrt(np.mean(distance**2)))
     at, chain = _resampled(splines, time)
     shape = smooth(chain + centre, max(SHAPE_TOLERANCE, SHAPE_SHARE * noise))
-    told.extend(_oddities(shape.geometry, limits or IMPORT_LIMITS))
+    warnings.extend(_oddities(shape.geometry, limits or IMPORT_LIMITS))
     metadata.update(
         smoothing="cross-validated" if smoothing is None else smoothing,
         rms_deviation=noise, max_deviation=float(distance.max()),
         positions=len(points), outliers=int((~kept).sum()), duplicates=reading.duplicates,
-        out_of_order=reading.out_of_order, unusable=reading.unusable, warnings=told,
+        out_of_order=reading.out_of_order, unusable=reading.unusable, warnings=warnings,
     )  # fmt: skip
     try:
         if limits is not None:
@@ -177,13 +179,13 @@ def _line(
                 *shape.geometry[:5], name=name, metadata={**metadata, "speed": "as recorded"},
                 speed=_recorded_speed(splines, at, chain, shape.geometry),
             )  # fmt: skip
-    except RuntimeError as error:  # the linear programme found no profile
+    except RuntimeError as error:  # the linear program found no profile
         raise _NoPathError(str(error)) from error
-    return DrivenLine(path, reading.topic, len(points), noise, float(distance.max()), told)
+    return DrivenLine(path, reading.topic, len(points), noise, float(distance.max()), warnings)
 
 
 def _averaged(time: Array, points: Array) -> tuple[Array, Array]:
-    """Means of time (m,) and positions (m, 2) within bins of time that hold any."""
+    """Return mean times (m,) and positions (m, 2) of the bins of time that are not empty."""
     cell = np.floor(time / BIN + 1e-6).astype(np.int64)
     _, group = np.unique(cell, return_inverse=True)
     count = np.bincount(group)
@@ -195,12 +197,12 @@ def _averaged(time: Array, points: Array) -> tuple[Array, Array]:
 def _robust(
     time: Array, points: Array, tolerance: float | None
 ) -> tuple[tuple[BSpline, BSpline], NDArray[np.bool_]]:
-    """Smoothing splines of points (m, 2) without those far off, and which were kept (m,)."""
+    """Return smoothing splines of points (m, 2) without outliers, and a mask (m,) of those kept."""
     kept = np.ones(len(time), dtype=np.bool_)
     for _ in range(OUTLIER_ROUNDS):
         splines = _smoothed(time[kept], points[kept], tolerance)
         distance = _distances(splines, time, points)
-        # The median distance of white noise in the plane is 1.18 of its deviation in each axis.
+        # Median distance of white noise in the plane: 1.18 standard deviations of each axis.
         noise = float(np.median(distance[kept])) / 1.1774
         far = distance > max(OUTLIER * noise, LEAST_OUTLIER)
         if (far == ~kept).all():
@@ -210,16 +212,16 @@ def _robust(
 
 
 def _distances(splines: tuple[BSpline, BSpline], time: Array, points: Array) -> Array:
-    """Distances (m,) of points (m, 2) from where splines are at their times."""
+    """Return the distances (m,) of points (m, 2) from the splines at their times."""
     x, y = (spline(time) for spline in splines)
     distances: Array = np.hypot(x - points[:, 0], y - points[:, 1])
     return distances
 
 
 def _smoothed(time: Array, points: Array, tolerance: float | None) -> tuple[BSpline, BSpline]:
-    """Smoothing splines of x and y (m, 2) over time, by cross-validation or to an rms distance."""
+    """Return smoothing splines of points (m, 2), cross-validated or to an rms distance, m."""
     if tolerance is None:
-        # Positions that do not move at all have nothing to validate: a straight east or north.
+        # A constant coordinate (a straight to the east or north) leaves nothing to validate.
         return tuple(
             make_smoothing_spline(time, values)
             if np.ptp(values) > 0.0
@@ -245,7 +247,7 @@ def _smoothed(time: Array, points: Array, tolerance: float | None) -> tuple[BSpl
 
 
 def _resampled(splines: tuple[BSpline, BSpline], time: Array) -> tuple[Array, Array]:
-    """Times (m,) and points (m, 2) along the splines, each `SPACING` from the one before it."""
+    """Return times (m,) and points (m, 2) along the splines, `SPACING` apart."""
     fine = np.arange(time[0], time[-1], 0.1 * BIN)
     dense = np.column_stack([spline(fine) for spline in splines])
     kept = [0]
@@ -268,30 +270,30 @@ def _resampled(splines: tuple[BSpline, BSpline], time: Array) -> tuple[Array, Ar
 def _recorded_speed(
     splines: tuple[BSpline, BSpline], at: Array, chain: Array, geometry: Geometry
 ) -> Array:
-    """Speed (n,) m/s on the path's grid, of points (m, 2) passed at times (m,)."""
+    """Return the speed (n,), m/s, on the path's grid from points (m, 2) passed at times (m,)."""
     speed = np.hypot(*(spline.derivative()(at) for spline in splines))
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(chain, axis=0).T))])
-    along *= geometry.arc_length[-1] / along[-1]  # chords are shorter than their arcs
+    along *= geometry.arc_length[-1] / along[-1]  # chords are shorter than arcs
     interpolated: Array = np.interp(geometry.arc_length, along, np.maximum(speed, LEAST_SPEED))
     return interpolated
 
 
 def _oddities(geometry: Geometry, limits: SpeedLimits) -> list[str]:
-    """What is accepted but should be known."""
-    told = []
+    """Return warnings about a path that is accepted but unusual."""
+    warnings = []
     curvature = np.abs(geometry.curvature)
     sharpest = int(np.argmax(curvature))
     steerable = math.tan(MAX_STEERING_ANGLE) / limits.wheelbase
     if curvature[sharpest] > steerable:
-        told.append(
+        warnings.append(
             f"curvature {curvature[sharpest]:.3f} 1/m at {geometry.arc_length[sharpest]:.1f} m is "
             f"beyond the {steerable:.3f} 1/m that a wheelbase of {limits.wheelbase:g} m can steer: "
             "more smoothing may help"
         )
     near = self_approach(geometry, closed=False)
     if near is not None:
-        told.append(
+        warnings.append(
             f"the path comes within {near[2]:.2f} m of itself, at {near[0]:.1f} m and "
             f"{near[1]:.1f} m: project with the last arc length at hand"
         )
-    return told
+    return warnings

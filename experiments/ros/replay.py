@@ -1,21 +1,32 @@
-"""Recorded sensors through the estimator and an agent: what it would have seen and done.
+"""Replay of a recorded drive: its sensor readings through the estimator and an agent.
 
-Readings go into the filter in the order of their stamps, with the recorded commands as the inputs
-in force. At every control period the agent is shown the path from where the estimate is, and what
-it proposes is set beside what was recorded. Nothing that it proposes moves anything: the drive is
-the recorded one.
+Readings enter the filter in the order of their stamps, with the recorded commands as inputs. In
+every control period the agent observes the path from the estimated state, and its action is
+compared with the recorded command. The agent's actions do not move the vehicle.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.ros.read import BagError
-from experiments.ros.recording import COURSE_BASE, Recording
-from experiments.ros.topics import SECOND, Commands, Odometry, Stamps
+from experiments.ros.read import BagError, info, read
+from experiments.ros.reference import datum_of
+from experiments.ros.topics import (
+    SECOND,
+    Commands,
+    Datum,
+    Fixes,
+    GeoPoint,
+    Imu,
+    Odometry,
+    Stamps,
+    Topic,
+    WheelSpeed,
+)
 from lpv_track_env.conditions.layout import WORST_OFFSET
 from lpv_track_env.estimation.estimator import Estimator, EstimatorSettings
 from lpv_track_env.estimation.observer import PathObserver
@@ -23,50 +34,158 @@ from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 
 Array = NDArray[np.float64]
+T = TypeVar("T", bound=Topic)
 
 FARTHEST_START = 20.0
-"""m from the path at which a drive belongs to another path, or another datum."""
+"""Distance from the path beyond which a drive cannot belong to it, m."""
+COURSE_SPEED = 2.0
+"""Speed above which an IMU's heading is compared with the course of the fixes, m/s."""
+COURSE_BASE = 2.0
+"""Distance between the fixes that a course is computed from, m."""
+WORST_HEADING = 0.15
+"""Median difference from the course beyond which an IMU's heading is left out, rad (9 degrees)."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Sensor readings and commands of a drive; optional topics are None if the bag has none."""
+
+    file: Path
+    fixes: Fixes
+    positions: Array
+    """(m, 2) m, of the fixes in the path's frame."""
+    commands: Commands
+    imu: Imu | None
+    wheel: WheelSpeed | None
+    odometry: Odometry | None
+    datum: GeoPoint
+    odometry_is_aligned: bool
+    """True if odometry was rotated and moved onto the fixes."""
+    remarks: list[str] = field(default_factory=list)
+
+
+def record(
+    file: Path, *, topics: dict[str, str] | None = None, datum: GeoPoint | None = None
+) -> Recording:
+    """Read the sensor readings and commands of a bag.
+
+    `topics` gives names by kind ("odometry", "imu", "wheel-speed", "fix", "command"), required for
+    kinds of which the bag has several. `datum` is the path's origin, by default the bag's own, else
+    the first fix.
+
+    Raises
+    ------
+    BagError
+        If there are no fixes, no commands, or several topics of a kind without a name.
+    """
+    named = topics or {}
+    bag = info(file)
+
+    def optional(kind: type[T]) -> T | None:
+        if kind.KIND not in named and not bag.of_kind(kind):
+            return None
+        return read(file, kind, named.get(kind.KIND)).data
+
+    fixes = read(file, Fixes, named.get(Fixes.KIND)).data
+    commands = read(file, Commands, named.get(Commands.KIND)).data
+    imu, wheel, odometry = optional(Imu), optional(WheelSpeed), optional(Odometry)
+    own_datum = optional(Datum)
+    origin = datum or datum_of(file, fixes)
+    positions = fixes.positions(origin)
+    remarks = []
+    if imu is not None:
+        imu, remark = _trusted(imu, fixes, positions)
+        remarks += remark
+    if wheel is None and odometry is not None:
+        wheel = WheelSpeed(odometry.stamp, odometry.longitudinal_speed)
+        remarks.append("no wheel speed: odometry's is taken in its place")
+    apart = odometry is not None and (own_datum is None or own_datum.frame != odometry.frame)
+    if odometry is not None and apart:
+        odometry = _aligned(file, odometry, fixes, positions)
+        remarks.append(
+            f"no datum of the frame {odometry.frame}: odometry is turned and moved onto the fixes"
+        )
+    return Recording(file, fixes, positions, commands, imu, wheel, odometry, origin, apart, remarks)
+
+
+def _trusted(imu: Imu, fixes: Fixes, positions: Array) -> tuple[Imu, list[str]]:
+    """Return the IMU without its heading if that is far off the fixes' course, and a remark."""
+    known = ~np.isnan(imu.heading)
+    kept = [0]
+    for k in range(1, len(positions)):
+        if math.dist(positions[k], positions[kept[-1]]) >= COURSE_BASE:
+            kept.append(k)
+    if len(kept) < 3 or not known.any():
+        return imu, []
+    steps = np.diff(positions[kept], axis=0)
+    taken = np.diff(fixes.stamp[kept]) / SECOND
+    at = 0.5 * (fixes.stamp[kept][1:] + fixes.stamp[kept][:-1])
+    heading = np.interp(at, imu.stamp[known], imu.heading[known])
+    off = np.angle(np.exp(1j * (heading - np.arctan2(steps[:, 1], steps[:, 0]))))
+    off = off[np.hypot(*steps.T) > COURSE_SPEED * taken]
+    if len(off) < 3 or abs(float(np.median(off))) <= WORST_HEADING:
+        return imu, []
+    remark = (
+        f"the IMU's heading is off the fixes' course by {float(np.median(off)):.2f} rad: left out"
+    )
+    columns = {name: getattr(imu, name) for name in imu.columns() if name != "heading"}
+    return Imu(imu.stamp, heading=np.full(len(imu), np.nan), **columns), [remark]
+
+
+def _aligned(file: Path, odometry: Odometry, fixes: Fixes, positions: Array) -> Odometry:
+    """Rotate and move odometry onto the fixes by least squares (Umeyama, 1991)."""
+    inside = (fixes.stamp >= odometry.stamp[0]) & (fixes.stamp <= odometry.stamp[-1])
+    if inside.sum() < 3:
+        raise BagError(f"{file}: odometry and fixes do not overlap in time")
+    own = np.interp(fixes.stamp[inside], odometry.stamp, odometry.x) + 1j * np.interp(
+        fixes.stamp[inside], odometry.stamp, odometry.y
+    )
+    theirs = positions[inside, 0] + 1j * positions[inside, 1]
+    turn = float(np.angle(np.sum(np.conj(own - own.mean()) * (theirs - theirs.mean()))))
+    moved = theirs.mean() + np.exp(1j * turn) * (odometry.x + 1j * odometry.y - own.mean())
+    return Odometry(
+        odometry.stamp, moved.real, moved.imag, odometry.heading + turn,
+        odometry.longitudinal_speed, odometry.lateral_speed, odometry.yaw_rate,
+        frame=odometry.frame,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Replay:
-    """What a replay gives, at the ends of control periods, (n,), and at fixes, (m,)."""
+    """Result of a replay, at the ends of n control periods and at m fixes."""
 
     recording: Recording
     path: ReferencePath
     time: Array
-    """s since the first fix."""
+    """(n,) s since the first fix."""
     estimate: Array
     """(n, 6) vx, vy, psi, r, X, Y."""
     deviation: Array
-    """(n,) m, of the position in its worst direction, as the filter believes."""
+    """(n,) m, the filter's standard deviation of the position in its worst direction."""
     lateral_error: Array
     """(n,) m, of the estimate, left of the path."""
     odometry: Array | None
-    """(n, 6) recorded, as `estimate`; NaN outside its span."""
+    """(n, 6) recorded, as `estimate`; NaN outside its time span."""
     proposed: Array
     """(n, 2) acceleration, steering angle; NaN beyond the path's end."""
     recorded: Array
     """(n, 2) commands in force from then on."""
     fix_time: Array
+    """(m,) s since the first fix."""
     fix_nis: Array
+    """(m,) normalised innovations squared of the fixes."""
     fix_used: NDArray[np.bool_]
-    """(m,) of the fixes that were used, or gated."""
+    """(m,) False where the filter's gate rejected the fix."""
     reading_nis: float
+    """Sum of the normalised innovations squared of all IMU and wheel readings used."""
     readings: int
-    """Sum of the NIS of all IMU and wheel readings that were used, and their number."""
+    """Number of those readings."""
     counts: dict[str, int]
-    """Fixes and readings, used and refused, by what came of them."""
+    """Fixes and readings, used and refused, by outcome."""
 
 
 class Inputs:
-    """Recorded commands as the piecewise constant inputs they are.
-
-    Parameters
-    ----------
-    commands
-        In force from their stamps on; before the first, that is.
-    """
+    """Recorded commands as piecewise constant inputs; the first also holds before its stamp."""
 
     def __init__(self, commands: Commands) -> None:
         self.stamp = commands.stamp
@@ -75,15 +194,15 @@ class Inputs:
         self.integral = np.vstack([np.zeros(2), np.cumsum(held, axis=0)])
 
     def before(self, stamp: int) -> Array:
-        """Inputs (2,) that were in force until a stamp."""
+        """Return the inputs (2,) in force until a stamp."""
         return self._at(int(np.searchsorted(self.stamp, stamp, "left")) - 1)
 
     def after(self, stamp: int) -> Array:
-        """Inputs (2,) that are in force from a stamp on."""
+        """Return the inputs (2,) in force from a stamp on."""
         return self._at(int(np.searchsorted(self.stamp, stamp, "right")) - 1)
 
     def mean(self, first: int, last: int) -> Array:
-        """Mean inputs (2,) between two stamps; at one stamp, those in force until then."""
+        """Return the mean inputs (2,) between two stamps; if equal, the inputs until then."""
         if last <= first:
             return self.before(last)
         whole: Array = (self._sum(last) - self._sum(first)) / ((last - first) / SECOND)
@@ -94,6 +213,7 @@ class Inputs:
         return found
 
     def _sum(self, stamp: int) -> Array:
+        """Return the integral (2,) of the inputs from the first stamp on."""
         index = max(int(np.searchsorted(self.stamp, stamp, "right")) - 1, 0)
         since = (stamp - int(self.stamp[index])) / SECOND
         total: Array = self.integral[index] + since * self.values[index]
@@ -110,42 +230,29 @@ def replay(
     control_period: float = 0.05,
     settings: EstimatorSettings | None = None,
 ) -> Replay:
-    """Replay a recording.
+    """Replay a recording in the frame of the path.
 
-    Parameters
-    ----------
-    recording
-        Of `record`, in the frame of the path.
-    path
-        The reference that the agent is shown.
-    vehicle
-        The vehicle of the estimator's model.
-    agent
-        Whatever has `predict`, for observations of `observer`'s layout.
-    observer
-        Of the path.
-    control_period
-        s between proposals.
-    settings
-        What the estimator believes.
+    The estimator has the `vehicle`'s model and the `settings`. The `agent` is called every
+    `control_period` (s) with observations by `observer`, which observes the same path.
 
     Raises
     ------
     BagError
-        If the sensors do not say where the drive begins, it begins far from the path, or fixes and
-        commands were not recorded at the same time.
+        If the readings do not determine the start, it is far from the path, or fixes and commands
+        do not overlap in time.
     """
-    start = _start(recording)
-    stamp, x, y, heading, speed = start
-    foot = path.project(x, y)
-    if abs(foot.lateral_error) > FARTHEST_START:
+    stamp, x, y, heading, speed = _start(recording)
+    distance = abs(path.project(x, y).lateral_error)
+    if distance > FARTHEST_START:
         raise BagError(
-            f"{recording.file}: the drive begins {abs(foot.lateral_error):.0f} m from the path: "
+            f"{recording.file}: the drive begins {distance:.0f} m from the path: "
             "give its own path, or the path's datum with --datum"
         )
-    run = _Run(recording, stamp, Estimator(vehicle, settings, period=min(control_period, 0.02)))
-    run.estimator.begin(0.0, x, y, heading, speed)
-    observer.begin(run.estimator.state)
+    estimator = Estimator(vehicle, settings, period=min(control_period, 0.02))
+    feeder = _Feeder(recording, stamp, estimator)
+    inputs = feeder.inputs
+    estimator.begin(0.0, x, y, heading, speed)
+    observer.begin(estimator.state)
     period = round(control_period * SECOND)
     last = min(int(recording.fixes.stamp[-1]), int(recording.commands.stamp[-1]))
     stamps = np.arange(stamp, last + 1, period)
@@ -154,17 +261,17 @@ def replay(
     rows: list[list[float]] = []
     memory: Any = None
     for k, now in enumerate(stamps.tolist()):
-        run.feed(now)
-        state = run.estimator.state
-        offset = float(np.clip(run.estimator.biases[2], -WORST_OFFSET, WORST_OFFSET))
-        acceleration, steering_angle = run.inputs.before(now)
+        feeder.feed(now)
+        state = estimator.state
+        offset = float(np.clip(estimator.biases[2], -WORST_OFFSET, WORST_OFFSET))
+        acceleration, steering_angle = inputs.before(now)
         observation = observer.observe(state, acceleration, steering_angle + offset)
         proposed = [math.nan, math.nan]
         if path.closed or observer.arc_length < path.length - 1e-6:
             action, memory = agent.predict(observation, memory, episode_start=np.array([k == 0]))
-            # The estimator knows that the wheels stand otherwise than they report.
+            # A command lacks the offset between the wheels' angle and the reported one.
             proposed = [float(action[0]), float(action[1]) - offset]
-        rows.append([*state, run.estimator.position_deviation, observer.lateral_error, *proposed])
+        rows.append([*state, estimator.position_deviation, observer.lateral_error, *proposed])
     table = np.array(rows)
     return Replay(
         recording, path,
@@ -172,15 +279,15 @@ def replay(
         estimate=table[:, :6], deviation=table[:, 6], lateral_error=table[:, 7],
         odometry=None if recording.odometry is None else _at(recording.odometry, stamps),
         proposed=table[:, 8:],
-        recorded=np.array([run.inputs.after(now) for now in stamps.tolist()]),
-        fix_time=np.array(run.fix_time), fix_nis=np.array(run.fix_nis),
-        fix_used=np.array(run.fix_used, dtype=np.bool_),
-        reading_nis=run.reading_nis, readings=run.readings, counts=run.estimator.counts,
+        recorded=np.array([inputs.after(now) for now in stamps.tolist()]),
+        fix_time=np.array(feeder.fix_time), fix_nis=np.array(feeder.fix_nis),
+        fix_used=np.array(feeder.fix_used, dtype=np.bool_),
+        reading_nis=feeder.reading_nis, readings=feeder.readings, counts=estimator.counts,
     )  # fmt: skip
 
 
 def _start(recording: Recording) -> tuple[int, float, float, float, float]:
-    """Stamp, x, y, heading and speed from which the estimator begins: at the first fix."""
+    """Return stamp, x, y, heading and speed at the first fix, where the estimator begins."""
     fixes, positions = recording.fixes, recording.positions
     imu, wheel = recording.imu, recording.wheel
     stamp = int(fixes.stamp[0])
@@ -202,21 +309,15 @@ def _start(recording: Recording) -> tuple[int, float, float, float, float]:
 
 
 def _at(odometry: Odometry, stamps: Stamps) -> Array:
-    """Odometry (n, 6) as states at some stamps, interpolated; NaN outside its span."""
-    columns = (
-        odometry.longitudinal_speed, odometry.lateral_speed, odometry.heading,
-        odometry.yaw_rate, odometry.x, odometry.y,
-    )  # fmt: skip
-    return np.column_stack(
-        [
-            np.interp(stamps, odometry.stamp, values, left=math.nan, right=math.nan)
-            for values in columns
-        ]
-    )
+    """Return odometry as states (n, 6), interpolated to stamps; NaN outside its time span."""
+    columns = ("longitudinal_speed", "lateral_speed", "heading", "yaw_rate", "x", "y")
+    values = (getattr(odometry, name) for name in columns)
+    outside = {"left": math.nan, "right": math.nan}
+    return np.column_stack([np.interp(stamps, odometry.stamp, one, **outside) for one in values])
 
 
-class _Run:
-    """Feeds an estimator with a recording's readings, up to one stamp after the other."""
+class _Feeder:
+    """Feeds a recording's readings to an estimator, up to one stamp after the other."""
 
     def __init__(self, recording: Recording, start: int, estimator: Estimator) -> None:
         self.estimator, self.inputs, self.start = estimator, Inputs(recording.commands), start
@@ -229,7 +330,7 @@ class _Run:
         self._next = 0
 
     def feed(self, until: int) -> None:
-        """Take in all readings with stamps up to `until` (ns), and predict to it."""
+        """Take all readings with stamps up to `until` (ns), and predict to that time."""
         while self._next < len(self._events) and self._events[self._next].stamp <= until:
             self._take(self._events[self._next])
             self._next += 1
@@ -237,6 +338,7 @@ class _Run:
             self._advance(until)
 
     def _advance(self, stamp: int, **readings: float) -> None:
+        """Predict to a stamp and correct by the readings there."""
         acceleration, steering_angle = self.inputs.mean(self._last, stamp)
         self.estimator.advance(
             (stamp - self.start) / SECOND, acceleration, steering_angle, **readings
@@ -248,20 +350,22 @@ class _Run:
             self.readings += count
 
     def _take(self, event: "_Event") -> None:
+        """Predict to an event and correct by its readings and its fix."""
         if event.readings or event.stamp > self._last:
             self._advance(event.stamp, **event.readings)
         if event.fix is None:
             return
-        came = self.estimator.take_fix((event.stamp - self.start) / SECOND, *event.fix)
-        if came in {"used", "gated"}:
-            self.fix_time.append((event.stamp - self.start) / SECOND)
+        time = (event.stamp - self.start) / SECOND
+        outcome = self.estimator.take_fix(time, *event.fix)
+        if outcome in {"used", "gated"}:
+            self.fix_time.append(time)
             self.fix_nis.append(self.estimator.fix_nis)
-            self.fix_used.append(came == "used")
+            self.fix_used.append(outcome == "used")
 
 
 @dataclass
 class _Event:
-    """What was read at one stamp."""
+    """Readings at one stamp."""
 
     stamp: int
     readings: dict[str, float]
@@ -269,24 +373,24 @@ class _Event:
 
 
 def _events(recording: Recording, start: int) -> list[_Event]:
-    """Readings from the first fix on, which begins the estimate, by stamp; equal stamps as one."""
+    """Return the readings after the first fix by stamp, with equal stamps merged."""
     found: dict[int, _Event] = {}
 
     def event(stamp: int) -> _Event:
         return found.setdefault(stamp, _Event(stamp, {}))
 
+    def add(name: str, stamps: Stamps, values: Array) -> None:
+        for stamp, value in zip(stamps.tolist(), values.tolist(), strict=True):
+            if not math.isnan(value):
+                event(stamp).readings[name] = value
+
     if recording.imu is not None:
-        for name in ("heading", "yaw_rate"):
-            values = getattr(recording.imu, name)
-            for stamp, value in zip(recording.imu.stamp.tolist(), values.tolist(), strict=True):
-                if not math.isnan(value):
-                    event(stamp).readings[name] = value
+        add("heading", recording.imu.stamp, recording.imu.heading)
+        add("yaw_rate", recording.imu.stamp, recording.imu.yaw_rate)
     if recording.wheel is not None:
-        wheel = recording.wheel
-        for stamp, value in zip(wheel.stamp.tolist(), wheel.speed.tolist(), strict=True):
-            event(stamp).readings["speed"] = value
-    for stamp, position in zip(
+        add("speed", recording.wheel.stamp, recording.wheel.speed)
+    for stamp, (x, y) in zip(
         recording.fixes.stamp.tolist(), recording.positions.tolist(), strict=True
     ):
-        event(stamp).fix = (position[0], position[1])
+        event(stamp).fix = (x, y)
     return [found[stamp] for stamp in sorted(found) if stamp > start]

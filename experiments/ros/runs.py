@@ -1,39 +1,50 @@
-"""A run of an environment as the topics of a bag."""
+"""Topics of a simulated run, as perfect sensors see it or with sensor errors."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from experiments.ros.topics import SECOND, Commands, Datum, Fixes, Imu, Odometry, Topic, WheelSpeed
+from experiments.ros.topics import (
+    SECOND,
+    Commands,
+    Datum,
+    Fixes,
+    GeoPoint,
+    Imu,
+    Odometry,
+    Topic,
+    WheelSpeed,
+)
 from experiments.run.rollout import Trace
+from lpv_track_env.conditions import Conditions
+from lpv_track_env.sensors import Sensors
 from trajectories.geodesy import geodetic
 
-Array = NDArray[np.float64]
+T = TypeVar("T", bound=Topic)
 
 DATUM = (45.0, 10.0, 0.0)
-"""deg, deg, m: where x = y = 0 lies unless told. A round place; nothing there matters."""
+"""Default position of x = y = 0, deg, deg, m; arbitrary round numbers."""
 START = SECOND
-"""ns: stamp of a run's start, as simulation time has it; 0 would be "not set" to ROS."""
+"""Stamp of a run's start, ns, in simulation time; ROS takes 0 for "not set"."""
 FIX_PERIOD = 0.1
-"""s: receivers give 10 positions a second."""
+"""Period of fixes, s; receivers give 10 positions a second."""
 STANDARD_GRAVITY = 9.80665
 
 
 def topics_of(
-    trace: Trace,
-    *,
-    datum: tuple[float, float, float] = DATUM,
-    start: int = START,
-    fix_period: float = FIX_PERIOD,
+    trace: Trace, *, datum: GeoPoint = DATUM, start: int = START, fix_period: float = FIX_PERIOD
 ) -> dict[str, Topic]:
-    """The truth of a run as topics by name: what perfect sensors would have seen.
+    """Return the true values of a run as topics by name, as perfect sensors would measure them.
 
     Parameters
     ----------
     trace
-        The run, n control periods. An IMU's acceleration is made of the differences of its
-        velocities: the mean over the periods before and after, whatever moved the vehicle.
+        The run, n control periods. The IMU's acceleration is the difference quotient of velocity,
+        averaged over the periods before and after.
     datum
-        Latitude, longitude (deg) and height (m) of x = y = 0; x points east there, y north.
+        Position of x = y = 0; x points east there, y north.
     start
         Stamp of the trace's time 0, ns.
     fix_period
@@ -42,8 +53,8 @@ def topics_of(
     Returns
     -------
     dict
-        /odom, /imu, /wheel_speed (n + 1 messages), /fix, /command (n: stamped when it comes into
-        force, so a period before the trace's own) and /datum.
+        /odom, /imu, /wheel_speed (n + 1 messages), /fix, /command (n, stamped when it takes effect,
+        a period before its entry in the trace) and /datum.
 
     Raises
     ------
@@ -63,7 +74,7 @@ def topics_of(
         Odometry(stamp, x, y, heading, vx, vy, yaw_rate),
         Imu(
             stamp, heading, yaw_rate,
-            # Velocity changes in a frame that turns: a = v' + r x v.
+            # Change of velocity in a rotating frame: a = v' + r x v.
             forward_acceleration=forward - yaw_rate * vy,
             leftward_acceleration=leftward + yaw_rate * vx,
             upward_acceleration=np.full_like(vx, STANDARD_GRAVITY),
@@ -76,9 +87,72 @@ def topics_of(
     return {topic.TOPIC: topic for topic in topics}
 
 
-def check_datum(datum: tuple[float, float, float]) -> None:
+def check_datum(datum: GeoPoint) -> None:
     """Raise a ValueError unless latitude, longitude (deg) and height (m) are on Earth."""
     if not (abs(datum[0]) <= 90.0 and abs(datum[1]) <= 180.0 and abs(datum[2]) <= 1e5):
         raise ValueError(
             f"a datum is latitude and longitude in degrees and height in m, not {datum}"
         )
+
+
+def measured(
+    topics: Mapping[str, Topic], conditions: Conditions, seed: int = 0
+) -> dict[str, Topic]:
+    """Return topics with the sensor errors of some conditions in /imu, /wheel_speed and /fix.
+
+    The errors are those of `lpv_track_env.sensors`: noise, biases, gyroscope drift, a scale error
+    of speed, and fixes that wander, drop out or are outliers. Other topics stay as they are. Fixes
+    keep their stamps, since bags are read by stamp. Covariances cover white noise, not biases.
+
+    Parameters
+    ----------
+    topics
+        As returned by `topics_of`.
+    conditions
+        Ranges of the errors, which are drawn once.
+    seed
+        Seed of the draws.
+    """
+
+    def of_kind(kind: type[T]) -> list[tuple[str, T]]:
+        return [(name, topic) for name, topic in topics.items() if isinstance(topic, kind)]
+
+    sensors = Sensors(conditions, seed)
+    drawn = sensors.drawn
+    read: dict[str, Topic] = dict(topics)
+    for name, imu in of_kind(Imu):
+        readings = [
+            sensors.inertial(*reading)
+            for reading in zip(imu.time, imu.heading, imu.yaw_rate, strict=True)
+        ]
+        heading, yaw_rate = np.array(readings).reshape(-1, 2).T
+        read[name] = replace(
+            imu,
+            heading=heading,
+            yaw_rate=yaw_rate,
+            heading_deviation=drawn["heading_noise"] or None,
+            yaw_rate_deviation=drawn["yaw_rate_noise"] or None,
+        )
+    for name, wheel in of_kind(WheelSpeed):
+        speed = np.array([sensors.wheel_speed(value) for value in wheel.speed])
+        read[name] = replace(wheel, speed=speed, speed_deviation=drawn["speed_noise"] or None)
+    for name, fixes in of_kind(Fixes):
+        datum = next(topic.last for _, topic in of_kind(Datum))
+        read[name] = _measured_fixes(fixes, datum, sensors)
+    return read
+
+
+def _measured_fixes(fixes: Fixes, datum: GeoPoint, sensors: Sensors) -> Fixes:
+    """Return fixes with errors, without those that drop out."""
+    readings = [
+        sensors.fix(time, x, y)
+        for time, (x, y) in zip(fixes.time, fixes.positions(datum), strict=True)
+    ]
+    received = np.array([fix is not None for fix in readings], dtype=np.bool_)
+    positions = np.array([fix for fix in readings if fix is not None]).reshape(-1, 2)
+    points = np.column_stack([positions, np.zeros(len(positions))])
+    latitude, longitude, height = geodetic(points, datum)
+    return Fixes(
+        fixes.stamp[received], latitude, longitude, height, frame=fixes.frame,
+        position_deviation=sensors.drawn["gnss_noise"] or None,
+    )  # fmt: skip

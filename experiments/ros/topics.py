@@ -1,14 +1,15 @@
-"""What a bag holds of a drive, as plain arrays: one class for each kind of topic.
+"""Topics of a drive as plain arrays, with one class for each kind of topic.
 
 SI units, radians. Frames are those of REP 103 and 105: x, y of `odom` point east and north of the
 datum, heading is counter-clockwise from x; `base_link` is the vehicle, x forward, y left, at its
 centre of gravity. Stamps are header stamps, nanoseconds since the epoch of the clock in use.
 
-A deviation is one standard deviation for all messages of a topic; None is unknown, which goes into
-covariances as each message's own convention has it (zeros).
+A deviation is one standard deviation for all messages of a topic, None if unknown; covariances are
+then zero, as the messages' conventions have it.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import ClassVar
 
@@ -19,9 +20,11 @@ from trajectories.geodesy import east_north_up
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
+GeoPoint = tuple[float, float, float]
+"""Latitude and longitude, deg, and height, m."""
 
 SECOND = 1_000_000_000
-"""ns."""
+"""1 s in ns."""
 ODOM, BASE_LINK = "odom", "base_link"
 
 
@@ -32,8 +35,8 @@ class Topic:
     Raises
     ------
     ValueError
-        If arrays differ in length, stamps do not increase, or a value is not finite (but for those
-        that may be NaN: not measured), naming field and index.
+        If arrays differ in length, stamps do not increase, or a value is not finite, naming field
+        and index. Fields in `MAY_BE_NAN` may be NaN, which means not measured.
     """
 
     stamp: Stamps
@@ -42,9 +45,9 @@ class Topic:
     """Header frame."""
 
     KIND: ClassVar[str] = "topic"
-    """What messages call it."""
+    """Name of the kind in options and messages."""
     TOPIC: ClassVar[str] = ""
-    """Where it is written unless told otherwise."""
+    """Default name of the topic."""
     MAY_BE_NAN: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
@@ -71,8 +74,12 @@ class Topic:
 
     @classmethod
     def columns(cls) -> tuple[str, ...]:
-        """Names of the arrays beside `stamp`."""
+        """Return the names of the arrays other than `stamp`."""
         return tuple(item.name for item in fields(cls) if item.type is Array)
+
+    def rows(self) -> Iterator[tuple[float, ...]]:
+        """Yield the values of the columns, message by message."""
+        return zip(*(getattr(self, name).tolist() for name in self.columns()), strict=True)
 
     def __len__(self) -> int:
         return len(self.stamp)
@@ -111,7 +118,7 @@ class Odometry(Topic):
 
 @dataclass(frozen=True, eq=False)
 class Imu(Topic):
-    """sensor_msgs/Imu of a level vehicle; NaN where something was not measured."""
+    """sensor_msgs/Imu of a level vehicle; NaN means not measured."""
 
     heading: Array
     """(n,) rad, unwrapped when read."""
@@ -120,7 +127,7 @@ class Imu(Topic):
     forward_acceleration: Array
     leftward_acceleration: Array
     upward_acceleration: Array
-    """(n,) m/s^2, specific force as accelerometers feel it: 9.80665 upwards at rest (REP 145)."""
+    """(n,) m/s^2, specific force: 9.80665 upwards at rest (REP 145)."""
     heading_deviation: float | None = None
     yaw_rate_deviation: float | None = None
     acceleration_deviation: float | None = None
@@ -135,7 +142,7 @@ class Imu(Topic):
 
 @dataclass(frozen=True, eq=False)
 class WheelSpeed(Topic):
-    """geometry_msgs/TwistWithCovarianceStamped (read: TwistStamped too), linear.x alone."""
+    """geometry_msgs/TwistWithCovarianceStamped (or TwistStamped when read), linear.x alone."""
 
     speed: Array
     """(n,) m/s, forward."""
@@ -155,7 +162,7 @@ class Fixes(Topic):
     height: Array
     """(n,) m above the ellipsoid, NaN where unknown."""
     position_deviation: float | None = None
-    """m, to the east and to the north."""
+    """m, of east and of north."""
 
     KIND: ClassVar[str] = "fix"
     TOPIC: ClassVar[str] = "/fix"
@@ -169,22 +176,22 @@ class Fixes(Topic):
                 value = getattr(self, name)[beyond[0]]
                 raise ValueError(f"fix: {name}[{beyond[0]}] is {value:g}, beyond {bound:g} degrees")
 
-    def positions(self, datum: tuple[float, float, float]) -> Array:
-        """(n, 2) m east and north of a datum (deg, deg, m); unknown heights are the datum's."""
+    def positions(self, datum: GeoPoint) -> Array:
+        """Return positions (n, 2), m east and north of a datum, whose height replaces NaN."""
         height = np.where(np.isnan(self.height), datum[2], self.height)
         return east_north_up(self.latitude, self.longitude, height, datum)[:, :2]
 
 
 @dataclass(frozen=True, eq=False)
 class Commands(Topic):
-    """ackermann_msgs/AckermannDriveStamped: what the actuators were told from a stamp on."""
+    """ackermann_msgs/AckermannDriveStamped: commands to the actuators, each from its stamp on."""
 
     acceleration: Array
-    """(n,) m/s^2, signed: the message leaves braking open, this project's commands need it."""
+    """(n,) m/s^2, negative when braking, on which the message's definition is silent."""
     steering_angle: Array
     """(n,) rad, left positive."""
     speed: Array
-    """(n,) m/s, to which the acceleration leads by the next command."""
+    """(n,) m/s, reached with this acceleration by the time of the next command."""
 
     KIND: ClassVar[str] = "command"
     TOPIC: ClassVar[str] = "/command"
@@ -192,7 +199,7 @@ class Commands(Topic):
 
 @dataclass(frozen=True, eq=False)
 class Datum(Topic):
-    """geographic_msgs/GeoPointStamped: where x = y = 0 of `frame` lies, as mavros publishes it."""
+    """geographic_msgs/GeoPointStamped: origin of `frame`, as mavros publishes it."""
 
     latitude: Array
     longitude: Array
@@ -205,8 +212,8 @@ class Datum(Topic):
     TOPIC: ClassVar[str] = "/datum"
 
     @property
-    def last(self) -> tuple[float, float, float]:
-        """Latitude, longitude (deg) and height (m) that were told last."""
+    def last(self) -> GeoPoint:
+        """The last origin."""
         return float(self.latitude[-1]), float(self.longitude[-1]), float(self.height[-1])
 
 

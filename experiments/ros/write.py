@@ -1,4 +1,4 @@
-"""Write bags: ROS 1 (one file) or ROS 2 (a folder; sqlite3 or mcap), as a whole or not at all."""
+"""Write bags atomically: ROS 1 (one file) or ROS 2 (a folder; sqlite3 or mcap)."""
 
 import heapq
 import os
@@ -15,9 +15,9 @@ from trajectories.naming import choose
 FORMATS = {"ros1": ROS1, "ros2": ROS2}
 STORAGES = ("sqlite3", "mcap")
 METADATA_VERSION: Literal[8] = 8
-"""Of rosbag2: 9 needs ROS 2 Jazzy, 8 is read by all distributions in use."""
+"""Version of rosbag2's metadata: all distributions in use read 8, while 9 needs ROS 2 Jazzy."""
 LAST_SECOND = {ROS1: 2**32, ROS2: 2**31}
-"""s, beyond which header stamps of a ROS version do not go."""
+"""Upper limit of header stamps by ROS version, s."""
 
 
 def write(
@@ -29,29 +29,28 @@ def write(
 ) -> None:
     """Write topics to a new bag, messages in the order of their stamps.
 
-    What is logged as the time of receipt is the header stamp.
+    The time of receipt is set to the header stamp.
 
     Parameters
     ----------
     file
-        A file NAME.bag for ROS 1, else a folder for ROS 2, unless `bag_format` says otherwise.
+        NAME.bag for ROS 1, another name for the folder of a ROS 2 bag.
     topics
-        Arrays by topic name, e.g. {"/odom": Odometry(...)}; truth and measurements can stand side
-        by side under names of their own.
+        Arrays by topic name, e.g. {"/odom": Odometry(...)}.
     bag_format
-        "ros1" or "ros2".
+        "ros1" or "ros2"; by default according to the name of the file.
     storage
-        Of ROS 2: "sqlite3" or "mcap".
+        Storage of a ROS 2 bag, "sqlite3" or "mcap".
 
     Raises
     ------
     ValueError
-        For a name that does not fit its format, no messages, stamps that ROS cannot hold, or a bag
-        that exists already: recordings are not replaced.
+        For a name that does not fit its format, no messages, stamps that ROS cannot represent, or
+        an existing bag, since recordings are not replaced.
     ModuleNotFoundError
         If `rosbags` is not installed.
     OSError
-        If it cannot be written; nothing is left then, nor after Ctrl-C.
+        If it cannot be written. Nothing is left behind then, nor after Ctrl-C.
     """
     ros = ros_version(file, bag_format)
     choose("storage", storage, STORAGES)
@@ -62,7 +61,7 @@ def write(
         _check_stamps(name, topic, ros)
     refuse_existing(file)
     file.parent.mkdir(parents=True, exist_ok=True)
-    # A folder beside the bag, in which it has its own name: rosbag2 writes the name into the bag.
+    # In a temporary folder, so that the bag has its final name, which rosbag2 writes into it.
     temporary = file.parent / f".{file.name}.{secrets.token_hex(4)}.tmp"
     try:
         temporary.mkdir()
@@ -80,7 +79,7 @@ def write(
 
 
 def ros_version(file: Path, bag_format: str | None) -> int:
-    """1 or 2, of a format or by a bag's name.
+    """Return 1 or 2 according to a format, by default according to a bag's name.
 
     Raises
     ------
@@ -99,12 +98,13 @@ def ros_version(file: Path, bag_format: str | None) -> int:
 
 
 def refuse_existing(file: Path) -> None:
-    """Raise a ValueError if there is something under a bag's name."""
+    """Raise a ValueError if a file or folder of a bag's name exists."""
     if file.exists() or file.is_symlink():
         raise ValueError(f"{file} exists already and is not replaced: give another name")
 
 
 def _check_stamps(name: str, topic: Topic, ros: int) -> None:
+    """Raise a ValueError unless a ROS version can represent a topic's stamps."""
     if not len(topic):
         return
     first, last = int(topic.stamp[0]), int(topic.stamp[-1])
@@ -116,7 +116,7 @@ def _check_stamps(name: str, topic: Topic, ros: int) -> None:
 
 
 def _messages(ros: int, topics: Mapping[str, Topic]) -> Iterator[tuple[str, int, bytes]]:
-    """Topic name, stamp and bytes of all messages, by stamp."""
+    """Yield topic name, stamp and bytes of all messages, ordered by stamp."""
 
     def named(name: str, topic: Topic) -> Iterator[tuple[int, str, bytes]]:
         return ((stamp, name, data) for stamp, data in serialise(ros, topic))
@@ -154,7 +154,7 @@ def _write_ros2(folder: Path, topics: Mapping[str, Topic], storage: str) -> None
     forever = QosTime(2147483647, 4294967295)
 
     def offered(topic: Topic) -> Qos:
-        """Reliable; a datum, told once, is kept for those who come later."""
+        """Return the quality of service: reliable, and latched for a datum, which is sent once."""
         kept = isinstance(topic, Datum)
         return Qos(
             QosHistory.KEEP_LAST, 1 if kept else 10, QosReliability.RELIABLE,
@@ -177,6 +177,6 @@ def _write_ros2(folder: Path, topics: Mapping[str, Topic], storage: str) -> None
 
 
 def _flush(file: Path) -> None:
-    """Have a file on disk before it gets its name."""
+    """Force a file's content to the disk."""
     with file.open("rb") as handle:
         os.fsync(handle.fileno())

@@ -16,14 +16,11 @@ from numpy.testing import assert_allclose
 import agents
 import trajectories
 from experiments.cli import main
-from experiments.ros.arguments import TOPIC_KINDS
 from experiments.ros.comparison import draw, summary
 from experiments.ros.read import BagError, info, read
-from experiments.ros.recording import record
-from experiments.ros.replay import Inputs, Replay, replay
-from experiments.ros.runs import topics_of
-from experiments.ros.sensors import measured
-from experiments.ros.topics import KINDS, SECOND, Commands, Odometry, Topic
+from experiments.ros.replay import Inputs, Replay, record, replay
+from experiments.ros.runs import measured, topics_of
+from experiments.ros.topics import SECOND, Commands, Odometry, Topic
 from experiments.ros.write import write
 from lpv_track_env.conditions import REALTIME, Conditions
 from lpv_track_env.estimation.observer import PathObserver
@@ -183,11 +180,6 @@ def test_fixes_and_commands_of_other_times(tmp_path: Path) -> None:
     write(tmp_path / "a.bag", topics)
     with pytest.raises(BagError, match="fixes and commands do not overlap in time"):
         replayed(tmp_path / "a.bag")
-
-
-def test_options_for_topics_are_those_that_errors_name() -> None:
-    kinds = {kind.KIND for kind in KINDS} - {"datum"}
-    assert set(TOPIC_KINDS) == kinds
 
 
 def test_the_command_from_export_to_replay(
