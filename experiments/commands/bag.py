@@ -73,8 +73,8 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--conditions", default="simulation", metavar="NAME", help="of the drive")
     parser.add_argument(
         "--sensors", metavar="NAME",
-        help="conditions, e.g. realtime, whose sensor errors /imu, /wheel_speed and /fix get, drawn "
-        "by --seed (default: none, the true values)",
+        help="conditions, e.g. realtime, whose sensor errors are added to /imu, /wheel_speed and "
+        "/fix, drawn by --seed (default: none, the true values)",
     )  # fmt: skip
     add_agent_settings(parser)
     add_settings(parser, "--env")

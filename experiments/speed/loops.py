@@ -167,37 +167,23 @@ def _learn(env: Any, steps: int) -> tuple[float, float]:
     """Return the VecEnv's share of the wall time of `learn`, and the seconds per env-step."""
     module("torch").set_num_threads(1)
     ppo = module("stable_baselines3").PPO
-    timed = _timed(env)
     rollout = min(ROLLOUT, max(steps // ENVS, 2))
-    model = ppo("MlpPolicy", timed, n_steps=rollout, device="cpu", seed=0)
+    model = ppo("MlpPolicy", env, n_steps=rollout, device="cpu", seed=0)
+    step, stepping = env.step, 0.0
+
+    def timed_step(actions: Any) -> Any:
+        nonlocal stepping
+        began = time.perf_counter()
+        result = step(actions)
+        stepping += time.perf_counter() - began
+        return result
+
+    env.step = timed_step
     began = time.perf_counter()
     model.learn(total_timesteps=steps)
     wall = time.perf_counter() - began
-    return timed.seconds / wall, wall / max(model.num_timesteps, 1)
-
-
-def _timed(env: Any) -> Any:
-    """Wrap a VecEnv to sum up the seconds of its steps."""
-    wrapper = module("stable_baselines3.common.vec_env").VecEnvWrapper
-
-    class Timed(wrapper):  # type: ignore[misc, valid-type]
-        seconds = 0.0
-
-        def reset(self) -> Any:
-            return self.venv.reset()
-
-        def step_async(self, actions: Any) -> None:
-            began = time.perf_counter()
-            self.venv.step_async(actions)
-            self.seconds += time.perf_counter() - began
-
-        def step_wait(self) -> Any:
-            began = time.perf_counter()
-            result = self.venv.step_wait()
-            self.seconds += time.perf_counter() - began
-            return result
-
-    return Timed(env)
+    env.step = step
+    return stepping / wall, wall / max(model.num_timesteps, 1)
 
 
 def training(section: Section, effort: Effort, tick: Tick) -> None:
