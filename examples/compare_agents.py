@@ -1,4 +1,4 @@
-"""Compare agents over seeds in a pool of processes; print means and 95 % intervals."""
+"""Compare agents over seeds in a pool of processes; print means and 95 % confidence intervals."""
 
 import argparse
 from collections import defaultdict
@@ -10,7 +10,7 @@ from experiments.run.engines import local_pool
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--agents", nargs="+", default=["lpv-nmpc", "stanley", "ppo"])
     parser.add_argument("--trajectory", default="T2")

@@ -1,7 +1,7 @@
-"""Two forms of one vector field: check x' = A(x, u) x + B(x, u) u, and differentiate it.
+"""Compare the vector field with its LPV form x' = A(x, u) x + B(x, u) u, and differentiate it.
 
-The same function runs on floats, on arrays and on CasADi's symbols. Prints the largest
-difference of both forms over random states, and the Jacobian's entry that A as printed lacks.
+The same function works on floats, arrays and CasADi symbols. Prints the largest difference of both
+forms over random states, and an entry of the Jacobian that A does not have.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from lpv_track_env.vehicle import VEHICLES
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--states", type=int, default=1000)
     options = parser.parse_args()

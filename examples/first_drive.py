@@ -1,4 +1,4 @@
-"""Drive a path with the LPV-NMPC; print how it ended and how far from the path it came."""
+"""Drive a path with the LPV-NMPC; print how the drive ended and the largest lateral error."""
 
 import argparse
 
@@ -10,7 +10,7 @@ import lpv_track_env  # noqa: F401  registers the ids
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trajectory", default="T2")
     parser.add_argument("--agent", default="lpv-nmpc", choices=agents.names())

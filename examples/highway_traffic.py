@@ -1,4 +1,4 @@
-"""Drive a lap among highway-env's traffic; print how it ended, the errors and the least gap."""
+"""Drive a lap in highway-env's traffic; print how it ended, lateral error and smallest gap."""
 
 import argparse
 
@@ -10,7 +10,7 @@ import lpv_track_env  # noqa: F401  registers the ids
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--agent", default="lpv-nmpc")
     parser.add_argument("--scene", default="racetrack")

@@ -1,4 +1,4 @@
-"""Read the NMPC's plan and diagnostics at one bend; print where it means to be in a second."""
+"""Print the NMPC's diagnostics and its plan for the next second, at the start of a bend."""
 
 import argparse
 
@@ -11,7 +11,7 @@ from agents.nmpc.rti_agent import RtiNmpc
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trajectory", default="T2")
     parser.add_argument("--start", type=float, default=55.0, help="arc length, m")
@@ -24,12 +24,12 @@ def main() -> None:
     start = {"arc_length": options.start, "lateral_error": options.offset}
     observation, _ = env.reset(seed=0, options=start)
     action, memory = agent.predict(observation, episode_start=np.array([True]))
-    told = agent.diagnostics(memory[0])
-    print(f"{told['status']} in {1e6 * told['seconds']:.0f} us, cost {told['cost']:.3f}")
-    print(f"action: {action[0]:.2f} m/s^2, {action[1]:.3f} rad; slack used: {told['slack']}")
-    # The plan is in the frame of the path's foot point: x along the tangent, y to the left.
-    for node in range(0, len(told["plan"]), 5):
-        x, y = told["plan"][node]
+    solve = agent.diagnostics(memory[0])
+    print(f"{solve['status']} in {1e6 * solve['seconds']:.0f} us, cost {solve['cost']:.3f}")
+    print(f"action: {action[0]:.2f} m/s^2, {action[1]:.3f} rad; slack used: {solve['slack']}")
+    # The origin of the plan is the nearest point of the path: x along its tangent, y to the left.
+    for node in range(0, len(solve["plan"]), 5):
+        x, y = solve["plan"][node]
         print(f"in {0.05 * node:.2f} s: {x:6.2f} m ahead, {y:6.2f} m to the left")
 
 

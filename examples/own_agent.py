@@ -1,4 +1,4 @@
-"""A controller of one's own beside the NMPC; print a table of both on some paths."""
+"""Write a controller and compare it with the NMPC on some paths."""
 
 import argparse
 
@@ -8,23 +8,23 @@ from lpv_track_env.observation import TrackingObservation
 
 
 class Proportional(TrackingAgent[None]):
-    """Steers as the bend needs, and back to the path, twice as hard for heading as for offset."""
+    """Feedforward of the path's curvature, and proportional feedback of the errors."""
 
     def new_memory(self) -> None:
-        """Nothing is remembered."""
+        """Return no memory: the control law is static."""
 
     def control(self, observation: TrackingObservation, memory: None) -> tuple[float, float]:
-        """Acceleration (m/s^2) and steering angle (rad)."""
+        """Return acceleration (m/s^2) and steering angle (rad)."""
         del memory
-        # What a bend needs at low speed, and feedback on what that leaves.
-        bend = self.task.vehicle.wheelbase * float(observation.preview_curvature[0])
-        back = -0.2 * float(observation.lateral_error) - 0.4 * float(observation.heading_error)
-        slower = float(observation.reference_speed - observation.longitudinal_speed)
-        return self.task.vehicle.rolling_deceleration + slower, bend + back
+        # At low speed, a curvature needs a steering angle of wheelbase times curvature.
+        feedforward = self.task.vehicle.wheelbase * float(observation.preview_curvature[0])
+        feedback = -0.2 * float(observation.lateral_error) - 0.4 * float(observation.heading_error)
+        speed_error = float(observation.longitudinal_speed - observation.reference_speed)
+        return self.task.vehicle.rolling_deceleration - speed_error, feedforward + feedback
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trajectories", nargs="+", default=["T2", "u-turn"])
     options = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Three ways to a path of one's own: segments, waypoints in a file, arrays; drive each of them."""
+"""Make paths from segments, from waypoints in a file and from arrays; drive each of them."""
 
 import argparse
 from pathlib import Path
@@ -14,15 +14,15 @@ LIMITS = SpeedLimits(max_speed=8.0, max_lateral_acceleration=1.5, max_accelerati
 
 
 def from_segments() -> trajectories.ReferencePath:
-    """Straights in metres, turns in degrees with their radius: the language of T1 to T6."""
+    """Make a path of straights (m) and turns (deg, radius in m), as T1 to T6 are described."""
     segments = shapes.fit(shapes.parse("S 40 | L 90 r15 | S 30 | R 60 r20 | S 40"), LIMITS)
     return shapes.from_geometry(shapes.build(segments), LIMITS, "segments")
 
 
 def from_waypoints(file: Path) -> trajectories.ReferencePath:
-    """Points 5 m apart in a file `x_m,y_m`: smoothed, resampled, given a speed that can be driven.
+    """Load a file `x_m,y_m` of points 5 m apart, which smooths them and plans a feasible speed.
 
-    Circuits with `w_tr_right_m,w_tr_left_m` and GPS logs with `lat,lon` are read the same way.
+    Circuits with `w_tr_right_m,w_tr_left_m` and GPS logs with `lat,lon` are loaded the same way.
     """
     x = np.arange(0.0, 120.0, 5.0)
     rows = np.column_stack([x, 3.0 * np.sin(x / 15.0)])
@@ -31,7 +31,7 @@ def from_waypoints(file: Path) -> trajectories.ReferencePath:
 
 
 def from_arrays() -> trajectories.ReferencePath:
-    """Everything given: a clothoid, whose curvature grows with arc length, at 5 m/s."""
+    """Make a clothoid, whose curvature grows with arc length, at 5 m/s, from all its arrays."""
     s = np.linspace(0.0, 80.0, 321)
     curvature = 0.06 * s / s[-1]
     heading = 0.5 * curvature * s
@@ -44,13 +44,13 @@ def from_arrays() -> trajectories.ReferencePath:
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--folder", type=Path, default=Path(), help="where paths are written")
+    parser.add_argument("--folder", type=Path, default=Path(), help="folder for the written paths")
     folder: Path = parser.parse_args().folder
     for path in (from_segments(), from_waypoints(folder / "waypoints.csv"), from_arrays()):
         file = folder / f"{path.name}-path.csv"
-        write(path, file)  # what every --trajectory takes
+        write(path, file)  # a file for any --trajectory option
         result = run_case({"agent": "lpv-nmpc", "trajectory": str(file)})
         sharpest = np.abs(path.curvature).max()
         print(

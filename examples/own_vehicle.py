@@ -1,4 +1,4 @@
-"""A vehicle of one's own, from a preset and as a file; print how both drive the same path."""
+"""Derive a vehicle from a preset, save it as a file, and drive the same path with both."""
 
 import argparse
 import json
@@ -9,10 +9,10 @@ from lpv_track_env.vehicle import VEHICLES
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trajectory", default="T2")
-    parser.add_argument("--folder", type=Path, default=Path(), help="where the file is written")
+    parser.add_argument("--folder", type=Path, default=Path(), help="folder for the written file")
     options = parser.parse_args()
 
     empty = VEHICLES["m2-minibus"]

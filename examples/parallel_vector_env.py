@@ -1,4 +1,4 @@
-"""Step many environments in one compiled call; print how fast, and that it is no other physics."""
+"""Step many environments in one compiled call; print the speed, and check one against a single."""
 
 import argparse
 import time
@@ -12,7 +12,7 @@ ID = "lpv_track_env/PathTracking-v0"
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--envs", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=200)
@@ -28,7 +28,7 @@ def main() -> None:
     envs.action_space.seed(0)
     envs.reset(seed=0)
     actions = [envs.action_space.sample() for _ in range(8)]
-    envs.step(actions[0])  # compiles, where nothing has been compiled yet
+    envs.step(actions[0])  # compiles on the first run
     began = time.perf_counter()
     ended = 0
     for k in range(options.steps):

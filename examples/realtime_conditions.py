@@ -1,6 +1,7 @@
-"""Drive with a real vehicle's sensors and actuators; print tracking errors and the estimate's.
+"""Drive with a real vehicle's sensors and actuators; print tracking and estimation errors.
 
-Then once more with fixes three times as noisy: conditions are fields that can be changed.
+A second drive has GNSS fixes that are three times as noisy: every field of the conditions can be
+changed.
 """
 
 import argparse
@@ -14,11 +15,11 @@ from lpv_track_env.conditions import REALTIME, Conditions
 
 
 def drive(trajectory: str, conditions: Conditions) -> tuple[float, float]:
-    """Root mean squares of the lateral error and of the estimate's distance from the truth, m."""
+    """Return the rms of the lateral error and of the position estimate's error, m."""
     env = gymnasium.make(
         "lpv_track_env/PathTracking-v0", trajectory=trajectory, conditions=conditions
     )
-    agent = agents.make("lpv-nmpc", env)  # knows the delays, and compensates them
+    agent = agents.make("lpv-nmpc", env)  # compensates the delays of the conditions
     observation, info = env.reset(seed=0)
     lateral, estimate = [], []
     done, start = False, True
@@ -33,7 +34,7 @@ def drive(trajectory: str, conditions: Conditions) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trajectory", default="T2")
     trajectory: str = parser.parse_args().trajectory

@@ -1,6 +1,6 @@
-"""Train PPO over the compiled vector environment and drive with what it learned.
+"""Train PPO in the compiled vector environment, save the policy and drive with it.
 
-Prints the trained policy's result on a path that it has not seen. Needs `lpv-track-env[rl]`.
+Prints the policy's result on a path that was not used in training. Needs `lpv-track-env[rl]`.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from lpv_track_env.vector_env import PathTrackingVectorEnv
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=3_000_000)
     parser.add_argument("--envs", type=int, default=512)

@@ -1,7 +1,7 @@
-"""Find weights of the NMPC by random search in compiled closed loops; print before and after.
+"""Tune the NMPC's weights by random search in compiled closed loops; print the best candidate.
 
-Every candidate drives the same paths under the same disturbances, all of them in one call.
-`lpv-track tune` has better ways; this shows what they are made of.
+All candidates drive the same paths under the same disturbances, in one call. `lpv-track tune` has
+better methods, built from the same parts.
 """
 
 import argparse
@@ -17,11 +17,11 @@ from lpv_track_env.vector_env import PathTrackingVectorEnv
 
 
 def main() -> None:
-    """Run it; `--help` lists the arguments."""
+    """Run the example; `--help` lists its options."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--candidates", type=int, default=16)
-    parser.add_argument("--drives", type=int, default=8, help="of each candidate")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of a drive")
+    parser.add_argument("--drives", type=int, default=8, help="per candidate")
+    parser.add_argument("--seconds", type=float, default=10.0, help="per drive")
     options = parser.parse_args()
 
     n = options.candidates * options.drives
@@ -36,11 +36,11 @@ def main() -> None:
     loop = ClosedLoop(envs, agent)
     default = TrackingWeights().as_array()
     factors = np.exp(np.random.default_rng(0).normal(0.0, 1.0, (options.candidates, 10)))
-    factors[0] = 1.0  # the default weights are a candidate, too
-    factors[:, 8:] = 1.0  # only ratios matter: R stays
+    factors[0] = 1.0  # the default weights are the first candidate
+    factors[:, 8:] = 1.0  # R stays fixed, since only ratios matter
     candidates = default * factors
 
-    # Drive d of every candidate has the same seed, so that candidates differ by nothing else.
+    # Drive d has the same seed for all candidates, so that they differ in their weights alone.
     loop.reset(seed=[d for _ in range(options.candidates) for d in range(options.drives)])
     tally = loop.drive(round(options.seconds / 0.05), np.repeat(candidates, options.drives, axis=0))
     each = scores_of(tally, envs.arrays.ends).reshape(options.candidates, options.drives)
