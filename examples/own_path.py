@@ -20,7 +20,7 @@ def from_segments() -> trajectories.ReferencePath:
 
 
 def from_waypoints(file: Path) -> trajectories.ReferencePath:
-    """Load a file `x_m,y_m` of points 5 m apart, which smooths them and plans a feasible speed.
+    """Write points 5 m apart and load them, which smooths them and plans a feasible speed.
 
     Circuits with `w_tr_right_m,w_tr_left_m` and GPS logs with `lat,lon` are loaded the same way.
     """
@@ -31,7 +31,7 @@ def from_waypoints(file: Path) -> trajectories.ReferencePath:
 
 
 def from_arrays() -> trajectories.ReferencePath:
-    """Make a clothoid, whose curvature grows with arc length, at 5 m/s, from all its arrays."""
+    """Make a clothoid (curvature grows linearly with arc length) at 5 m/s from its arrays."""
     s = np.linspace(0.0, 80.0, 321)
     curvature = 0.06 * s / s[-1]
     heading = 0.5 * curvature * s

@@ -22,46 +22,42 @@ if TYPE_CHECKING:
     from experiments.ros.read import BagInfo
 
 EXAMPLE = "lpv-track bag export --trajectory T2 --out run.bag"
+ACTIONS = {
+    "export": (
+        "Drive a trajectory and write the run as a ROS bag.",
+        "--agent lpv-nmpc --trajectory T2 --out run.bag",
+    ),
+    "info": ("List a bag's topics, and what of them can be used here.", "run.bag"),
+    "reference": (
+        "Make a reference path of a recorded drive, as a CSV file that --trajectory takes.",
+        "run.bag --out path.csv",
+    ),
+    "replay": (
+        "Feed a drive's sensors to the estimator and an agent, and compare with the recording.",
+        "run.bag --trajectory T2 --out results/replay",
+    ),
+}
+"""Summary and example of each action."""
 SELECTED = tuple(kind.KIND for kind in KINDS if kind is not Datum)
 """Kinds of topics with an option --KIND-topic, which selects one of several in a bag."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Declare the actions `export`, `info`, `reference` and `replay` and their options."""
+    """Declare the actions and their options."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-
-    def add(name: str, summary: str, example: str) -> argparse.ArgumentParser:
-        return actions.add_parser(
+    declare = {"export": _add_export, "reference": _add_reference, "replay": _add_replay}
+    for name, (summary, example) in ACTIONS.items():
+        action = actions.add_parser(
             name,
             help=summary,
             description=summary,
             epilog=f"example: lpv-track bag {name} {example}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-
-    _add_export(
-        add(
-            "export",
-            "Drive a trajectory and write the run as a ROS bag.",
-            "--agent lpv-nmpc --trajectory T2 --out run.bag",
-        )
-    )
-    info = add("info", "List a bag's topics, and what of them can be used here.", "run.bag")
-    info.add_argument("file", type=Path, metavar="FILE")
-    _add_reference(
-        add(
-            "reference",
-            "Make a reference path of a recorded drive, as a CSV file that --trajectory takes.",
-            "run.bag --out path.csv",
-        )
-    )
-    _add_replay(
-        add(
-            "replay",
-            "Feed a drive's sensors to the estimator and an agent, and compare with the recording.",
-            "run.bag --trajectory T2 --out results/replay",
-        )
-    )
+        if name != "export":
+            action.add_argument("file", type=Path, metavar="FILE")
+        if name in declare:
+            declare[name](action)
 
 
 def _add_export(parser: argparse.ArgumentParser) -> None:
@@ -92,7 +88,6 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_reference(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, metavar="FILE")
     parser.add_argument("--out", type=Path, required=True, metavar="CSV")
     parser.add_argument(
         "--source", choices=["odometry", "fix"], help="default: odometry, if there is any"
@@ -110,7 +105,6 @@ def _add_reference(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_replay(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, metavar="FILE")
     parser.add_argument(
         "--trajectory", required=True, metavar="NAME", help="a name, or a file of `bag reference`"
     )

@@ -5,9 +5,8 @@ import json
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -28,32 +27,20 @@ LEAST_COMPARED = 0.9
 """Share of the situations in which an oracle must have an answer."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """Row of the table: a measure, and the goal that it has to meet.
-
-    Parameters
-    ----------
-    measure
-        Its key in a result's measures.
-    title
-        First column of the table.
-    goal
-        Largest acceptable magnitude, or None for information only.
-    share
-        Least share of the situations within the goal.
-    signed
-        True if the measure is a difference whose sign matters.
-    sampled
-        True if only some situations have the measure.
-    """
+class Row(NamedTuple):
+    """Row of the table: a measure, and the goal that it has to meet."""
 
     measure: str
+    """Key in a result's measures."""
     title: str
     goal: float | None = None
+    """Largest acceptable magnitude, or None for information only."""
     share: float = 1.0
+    """Least share of the situations within the goal."""
     signed: bool = False
+    """True if the measure is a difference whose sign matters."""
     sampled: bool = False
+    """True if only some situations have the measure."""
 
 
 ROWS = (

@@ -13,6 +13,7 @@ from agents.base import DrivingTask
 from agents.nmpc.casadi_solver import CasadiSolver
 from agents.nmpc.fatrop_solver import FatropSolver
 from agents.nmpc.ipopt_agent import IpoptNmpc
+from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.reference import steady_turn
 from agents.registry import agent_class
@@ -20,7 +21,6 @@ from agents.weights import TrackingWeights
 from experiments.run.suites import PAPER_VEHICLES, SIX
 from experiments.verify.oracles import (
     CasadiDerivatives,
-    Derivatives,
     PiqpOracle,
     PlanCost,
     plan_cost,
@@ -154,8 +154,8 @@ class RealTimeSolver(Protocol):
         """Do up to `iterations` iterations; as `CasadiSolver.solve`."""
         ...
 
-    def linearise(self, state: Array, inputs: Array) -> Any:
-        """Roll the inputs (N, 2) out from a state (6,); a tuple with the fields of Derivatives."""
+    def linearise(self, state: Array, inputs: Array) -> Linearisation:
+        """Roll the inputs (N, 2) out from a state (6,); return a Linearisation."""
         ...
 
     def solve_qp(
@@ -206,14 +206,14 @@ class Bench:
             **self._optimum(situation, fatrop=fatrop),
         }
 
-    def _linearisation(self, situation: Situation, along: Derivatives) -> Measures:
+    def _linearisation(self, situation: Situation, along: Linearisation) -> Measures:
         """Compare the roll-out and its derivatives with CasADi's."""
         ours = self.one_step.linearise(situation.state, situation.inputs)
         return {
             name: scaled_error(getattr(ours, name), getattr(along, name)) for name in along._fields
         }
 
-    def _qp(self, situation: Situation, along: Derivatives) -> Measures:
+    def _qp(self, situation: Situation, along: Linearisation) -> Measures:
         """Compare the optimal inputs of one QP with PIQP's."""
         state, last, reference, weights = situation.parameters
         theirs = self.piqp.solve(last, reference, weights, situation.inputs, along)

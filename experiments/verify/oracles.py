@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from agents.nmpc.casadi_solver import discrete_model, lpv_field
+from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import INPUTS, SOFT, STATES, NmpcProblem
 from lpv_track_env import lpv
 from lpv_track_env.bicycle import PSI, VX, VY, X, Y, derivative
@@ -87,25 +88,8 @@ def plan_cost(
     return PlanCost(float(tracking + effort + penalty), slack, excess)
 
 
-class Derivatives(NamedTuple):
-    """Roll-out x_{i+1} = F(x_i, u_i) of the discrete model, and its derivatives."""
-
-    states: Array
-    """(N + 1, 6)."""
-    A: Array
-    """dF/dx, (N, 6, 6)."""
-    B: Array
-    """dF/du, (N, 6, 2)."""
-    rate: Array
-    """vx'(x_i, u_i), (N,), m/s^2."""
-    rate_x: Array
-    """dvx'/dx, (N, 6)."""
-    rate_u: Array
-    """dvx'/du, (N, 2)."""
-
-
 class CasadiDerivatives:
-    """Derivatives of a problem's discrete model by CasADi's automatic differentiation."""
+    """Linearisation of a problem's discrete model by CasADi's automatic differentiation."""
 
     def __init__(self, problem: NmpcProblem) -> None:
         x, u = ca.SX.sym("x", STATES), ca.SX.sym("u", INPUTS)
@@ -117,10 +101,10 @@ class CasadiDerivatives:
         ]
         self._function = ca.Function("derivatives", [x, u], outputs)
 
-    def along(self, state: Array, inputs: Array) -> Derivatives:
+    def along(self, state: Array, inputs: Array) -> Linearisation:
         """Roll the inputs (N, 2) out from a state (6,) and differentiate at every step."""
         n = len(inputs)
-        result = Derivatives(
+        result = Linearisation(
             np.empty((n + 1, STATES)),
             np.empty((n, STATES, STATES)),
             np.empty((n, STATES, INPUTS)),
@@ -179,7 +163,7 @@ class PiqpOracle:
         reference: Array,
         weights: Array,
         inputs: Array,
-        along: Derivatives,
+        along: Linearisation,
     ) -> Array | None:
         """Return the optimal inputs (N, 2) for the roll-out of `inputs` (N, 2).
 
@@ -218,7 +202,7 @@ class PiqpOracle:
             gradient[x] = -lpv.C.T @ (outputs * reference[i + 1])
         return hessian, gradient
 
-    def _dynamics(self, inputs: Array, along: Derivatives) -> tuple[Array, Array]:
+    def _dynamics(self, inputs: Array, along: Linearisation) -> tuple[Array, Array]:
         """Return matrix (6 N, n) and right-hand side (6 N,) of the linearised model."""
         n = self.problem.horizon
         matrix, vector = np.zeros((n * STATES, n * STAGE)), np.zeros(n * STATES)
@@ -234,7 +218,7 @@ class PiqpOracle:
         return matrix, vector
 
     def _constraints(
-        self, last_input: Array, inputs: Array, along: Derivatives
+        self, last_input: Array, inputs: Array, along: Linearisation
     ) -> tuple[Array, Array, Array]:
         """Return rows (m, n), lower and upper bounds (m,) of the general inequalities."""
         problem, car = self.problem, self.problem.vehicle

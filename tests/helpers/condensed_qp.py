@@ -9,8 +9,8 @@ linearised along, and every slack is the least that its soft constraint needs::
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import NmpcProblem
-from experiments.verify.oracles import Derivatives
 from lpv_track_env.bicycle import PSI, VX, VY, X, Y
 from tests.helpers.nmpc_situations import Situation
 
@@ -26,7 +26,7 @@ class CondensedQp:
         problem: NmpcProblem,
         damping: tuple[float, float],
         situation: Situation,
-        along: Derivatives,
+        along: Linearisation,
     ) -> None:
         self.problem, self.situation = problem, situation
         n, car, plan = problem.horizon, problem.vehicle, situation.inputs.ravel()

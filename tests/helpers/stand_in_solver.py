@@ -1,7 +1,7 @@
-"""Solvers with the real-time solver's interface, for the tests of what verifies it.
+"""Stand-ins for the real-time solver, to test that `lpv-track verify` tells right from wrong.
 
-`StandIn` is right by other means: finite differences, a condensed QP by qpOASES, fatrop for the
-converged plan. The others are wrong in one thing each.
+`StandIn` is correct by other methods: finite differences, a condensed QP by qpOASES, fatrop for the
+converged plan. Each of the others has one error.
 """
 
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ class StandIn:
         self.iterations = iterations
 
     def step(self, states: Array, inputs: Array) -> Array:
-        """One period from each of states (6, n) with inputs (2, n)."""
+        """Integrate states (6, n) with inputs (2, n) over one period."""
         h, car = self.problem.period / self.problem.substeps, self.problem.vehicle
         for _ in range(self.problem.substeps):
             k1 = derivative(states, inputs, car)
@@ -37,7 +37,7 @@ class StandIn:
         return states
 
     def linearise(self, state: Array, inputs: Array) -> Any:
-        """Central differences of fourth order."""
+        """Differentiate by fourth-order central differences."""
         states, h = [state], 1e-3
         jacobians, rates, rate_jacobians = [], [], []
         moves = np.hstack([k * h * np.eye(8) for k in (-2, -1, 1, 2)])
@@ -63,7 +63,7 @@ class StandIn:
     def solve_qp(
         self, state: Array, last_input: Array, reference: Array, weights: Array, inputs: Array
     ) -> tuple[Status, Array]:
-        """Condensed: every x_i is an affine function of the inputs, which qpOASES then chooses.
+        """Solve the condensed QP, in which every x_i is an affine function of the inputs.
 
         Variables: the moves w = u - inputs (2 N), the slacks (3 N).
         """
@@ -144,7 +144,7 @@ class StandIn:
 
 
 class WrongDerivative(StandIn):
-    """A sign lost in one entry of B."""
+    """Has the wrong sign in one entry of B."""
 
     def linearise(self, state: Array, inputs: Array) -> Any:
         along = super().linearise(state, inputs)
@@ -153,7 +153,7 @@ class WrongDerivative(StandIn):
 
 
 class HeldInput(StandIn):
-    """Converges to a plan that is no optimum: the input in force, held."""
+    """Converges to a plan that is not optimal: it holds the last input."""
 
     def solve(
         self,
@@ -175,7 +175,7 @@ class HeldInput(StandIn):
 
 
 class Failing(StandIn):
-    """Solves nothing."""
+    """Fails in every solve."""
 
     def solve_qp(self, *parameters: Array) -> tuple[Status, Array]:
         return Status.MAXITER, np.full_like(parameters[-1], np.nan)
