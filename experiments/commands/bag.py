@@ -27,7 +27,7 @@ ACTIONS = {
         "Drive a trajectory and write the run as a ROS bag.",
         "--agent lpv-nmpc --trajectory T2 --out run.bag",
     ),
-    "info": ("List a bag's topics, and what of them can be used here.", "run.bag"),
+    "info": ("List a bag's topics and how they can be used.", "run.bag"),
     "reference": (
         "Make a reference path of a recorded drive, as a CSV file that --trajectory takes.",
         "run.bag --out path.csv",

@@ -127,7 +127,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def _spec(index: int, seed: int, solver: str) -> dict[str, Any]:
-    """Return what determines one situation and its measures, for a worker."""
+    """Return the spec of a situation for a worker process."""
     from experiments.run.suites import PAPER_VEHICLES
     from experiments.verify.bench import FATROP_EVERY, kind
 

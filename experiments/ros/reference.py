@@ -3,7 +3,7 @@
 Smoothing splines over time remove noise from x and y, by generalised cross-validation (Craven and
 Wahba, 1979) or to a given tolerance. The splines are resampled by distance, which removes
 standstill, and become a path at 0.25 m of arc length, with heading and curvature from a spline's
-derivatives. The speed is that of the smoothing splines, or planned anew.
+derivatives. The speed is that of the smoothing splines, or planned.
 """
 
 import math

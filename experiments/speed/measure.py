@@ -68,7 +68,7 @@ class Effort:
     processes: int = 3
     """Fresh processes per program."""
     cold: bool = True
-    """Whether to start processes with an empty numba cache too, at 10 s and more each."""
+    """True to also start processes with an empty numba cache, 10 s or more each."""
     large: int = 4096
     """Environments in the vector environment whose memory is measured."""
 

@@ -83,8 +83,8 @@ def child(program: str, cache: Path | None = None) -> tuple[float, float]:
     except subprocess.TimeoutExpired:
         raise Unavailable(f"not done within {LIMIT:.0f} s") from None
     if ended.returncode != 0:
-        said = ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"]
-        raise Unavailable(said[-1])
+        lines = ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"]
+        raise Unavailable(lines[-1])
     report: dict[str, Any] = json.loads(ended.stdout.strip().splitlines()[-1])
     return report["done"] - began, float(report["peak"])
 

@@ -127,7 +127,7 @@ def solvers(section: Section, effort: Effort, tick: Tick) -> None:
     section.notes.append(
         f"Seconds per predict(), all in, from Python, one thread, one vehicle; N {HORIZON}, Ts "
         f"{CONTROL_PERIOD} s. Windows of {effort.window} consecutive control periods of a closed "
-        f"loop on {' and '.join(effort.trajectories)}, each begun 0.2 m beside the path; the first "
+        f"loop on {' and '.join(effort.trajectories)}, each started 0.2 m off the path; the first "
         "solve of a window is a series of its own. A ratio is that of two medians over one window."
     )
     _over_windows(section, effort, tick, HORIZON, effort.windows, effort.repeats)
