@@ -15,7 +15,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--trajectories", nargs="+", default=["T2", "T4"], metavar="NAME")
     add_seeds(parser, 10)
     parser.add_argument(
-        "--times", type=Path, metavar="FILE", help="recorded times of a run before: times.json"
+        "--times",
+        type=Path,
+        metavar="FILE",
+        help="times.json of an earlier run, in place of recording",
     )
     add_out(parser, "results/latency")
     add_workers(parser)
@@ -23,7 +26,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command and return its exit code."""
-    from experiments.realtime.latency import compare
+    from experiments.parallel.latency import compare
 
     with resumable(options, console):
         return compare(

@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.parallel.mailbox import Mailbox, Message, Reader
-from experiments.parallel.messages import ESTIMATE
 from experiments.parallel.processes import READY, Child, Link, quiet
+from experiments.parallel.setup import ESTIMATE
 
 VALUES = 1000
 """Written for each way of waiting, not counting the first."""

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from agents import Agent
 from agents.base import stopping_acceleration
 from experiments.parallel.mailbox import Reader, Writer
-from experiments.parallel.messages import (
+from experiments.parallel.processes import ATTACHED, READY, Link, quiet
+from experiments.parallel.setup import (
     COMMAND,
     DRIVING,
     FAILED,
@@ -18,9 +19,8 @@ from experiments.parallel.messages import (
     NOT_FINITE,
     STALE_ESTIMATE,
     STALE_PERIODS,
+    Setup,
 )
-from experiments.parallel.processes import ATTACHED, READY, Link, quiet
-from experiments.parallel.setup import Setup
 from lpv_track_env.bicycle import VX, X, Y
 from lpv_track_env.estimation.observer import PathObserver
 from lpv_track_env.vehicle import VehicleParameters

@@ -7,9 +7,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from experiments.parallel.mailbox import Reader, Writer
-from experiments.parallel.messages import ESTIMATE, SAMPLE
 from experiments.parallel.processes import ATTACHED, READY, Link, quiet
-from experiments.parallel.setup import MS_PER_SECOND, Setup
+from experiments.parallel.setup import ESTIMATE, MS_PER_SECOND, SAMPLE, Setup
 from lpv_track_env import vehicle
 from lpv_track_env.conditions.layout import WORST_OFFSET
 from lpv_track_env.estimation.estimator import Estimator

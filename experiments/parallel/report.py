@@ -1,152 +1,23 @@
-"""What a run came to: numbers for JSON and a table for the console."""
-
-import math
-from typing import Any
+"""Report of a run on the console, and its figure `run.png`."""
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from experiments.parallel.messages import DRIVING, REASONS, STALE_PERIODS
-from experiments.parallel.recording import Driven, Outcome, Recording
-from experiments.parallel.setup import Setup
-from experiments.run.metrics import rms
-from lpv_track_env.bicycle import PSI, VX, X, Y
-
-Array = NDArray[np.float64]
-Summary = dict[str, Any]
-
-HELD = 0.99
-"""Share of the control periods that must be answered in time for the rate to count as held."""
-COMPLETE = ("seconds", "finished")
-"""Ends of a run that went as it should."""
-
-
-def spread(values: Array) -> Summary | None:
-    """Median, 99th percentile and greatest of some times (s); None of none."""
-    if values.size == 0:
-        return None
-    return {
-        "median": float(np.median(values)),
-        "p99": float(np.percentile(values, 99)),
-        "max": float(values.max()),
-    }
-
-
-def summarise(setup: Setup, outcome: Outcome) -> Summary:
-    """Everything that is reported of a run, plain values; times in s, lengths in m."""
-    recording = outcome.recording
-    summary: Summary = {
-        "end": outcome.end,
-        "fault": outcome.fault,
-        "stop": {
-            "seconds": outcome.stop[0], "distance": outcome.stop[1],
-            "final_speed": outcome.final_speed,
-        },
-        **timing(setup, recording),
-        "faults": faults(setup, outcome),
-    }  # fmt: skip
-    if len(recording.rows) > 1:
-        summary["tracking"] = tracking(recording.driven())
-        summary["estimation"] = estimation(recording)
-    summary["complete"] = outcome.end in COMPLETE
-    summary["held"] = summary["periods"] > 0 and summary["answered_share"] >= HELD
-    return summary
-
-
-def timing(setup: Setup, recording: Recording) -> Summary:
-    """Rate, deadlines and latencies."""
-    applied = recording.applied()
-    # While no estimate comes, the last one is answered again and again.
-    _, first = np.unique(applied["period"], return_index=True)
-    applied = {name: column[first] for name, column in applied.items()}
-    periods = max(len(recording.rows) - 1, 0)
-    in_time = applied["latency"] <= setup.period
-    answered = int(np.sum(in_time & (applied["period"] < periods)))
-    solves = applied["solve_time"][applied["solve_time"] > 0.0]
-    share = answered / periods if periods else 0.0
-    return {
-        "periods": periods,
-        "answered_in_time": answered,
-        "answered_share": share,
-        "deadline_misses": periods - answered,
-        "rate": setup.rate * share,
-        "wake_to_action": spread(applied["latency"]),
-        "stages": {
-            "sample_to_estimate": spread(applied["estimated"]),
-            "estimate_to_command": spread(applied["commanded"] - applied["estimated"]),
-            "command_to_action": spread(applied["latency"] - applied["commanded"]),
-        },
-        "solve_time": spread(solves),
-        "estimate_age": spread(np.array(recording.ages)),
-        "vehicle_lateness": spread(np.array(recording.lateness)),
-    }
-
-
-def faults(setup: Setup, outcome: Outcome) -> Summary:
-    """What went wrong, and who braked for it."""
-    applied = outcome.recording.applied()
-    reasons = applied["reason"].astype(int)
-    return {
-        "stale_brakings": [
-            {
-                "began": one.began,
-                "age_periods": one.age / setup.period,
-                "seconds": None if one.ended is None else one.ended - one.began,
-            }
-            for one in outcome.stale_brakings
-        ],
-        "commands_to_brake": {
-            name: int(np.sum(reasons == code))
-            for code, name in enumerate(REASONS)
-            if code != DRIVING
-        },
-        "failed_solves": int(applied["failures"].max(initial=0)),
-        "commands_refused": outcome.commands_refused,
-    }
-
-
-def tracking(driven: Driven) -> Summary:
-    """Errors of the true vehicle, as `experiments.run.metrics` defines them."""
-    return {
-        "mle": float(np.abs(driven.lateral_error).max()),
-        "ale": rms(driven.time, driven.lateral_error),
-        "moe": float(np.abs(driven.heading_error).max()),
-        "aoe": rms(driven.time, driven.heading_error),
-        "rms_speed_error": rms(driven.time, driven.speed_error),
-    }
-
-
-def estimation(recording: Recording) -> Summary:
-    """Errors of the estimates against the truth of their periods, and what came of the readings."""
-    errors = []
-    last = None
-    for period, estimate in sorted(recording.estimates.items()):
-        if period < len(recording.rows):
-            truth = recording.rows[period][1]
-            last = estimate
-            errors.append(np.asarray(estimate["state"]) - truth)
-    if last is None:
-        return {}
-    table = np.array(errors)
-    position = np.hypot(table[:, X], table[:, Y])
-    heading = (table[:, PSI] + math.pi) % (2.0 * math.pi) - math.pi
-    return {
-        "position_rms": float(np.sqrt(np.mean(position**2))),
-        "position_max": float(position.max()),
-        "heading_rms": float(np.sqrt(np.mean(heading**2))),
-        "speed_rms": float(np.sqrt(np.mean(table[:, VX] ** 2))),
-        **{
-            name: int(last[name])
-            for name in ("fixes_used", "fixes_refused", "readings_refused", "samples_lost")
-        },
-    }
+from experiments.figures import COLOURS
+from experiments.parallel.recording import Driven, Outcome, Recording, Summary
+from experiments.parallel.setup import STALE_PERIODS, Setup
+from lpv_track_env.bicycle import VX, X, Y
+from trajectories import ReferencePath
 
 
 def table(setup: Setup, summary: Summary) -> Table:
-    """The report for a console."""
+    """Return the table of latencies for a console."""
     rows = Table(box=box.SIMPLE_HEAD)
     for heading in ("", "median", "99 %", "max"):
         rows.add_column(heading, justify="left" if not heading else "right")
@@ -171,21 +42,21 @@ def table(setup: Setup, summary: Summary) -> Table:
 
 
 def sentences(summary: Summary) -> list[str]:
-    """What the table does not hold, a line each."""
+    """Return what the table does not hold, a line each."""
     share, misses = 100.0 * summary["answered_share"], summary["deadline_misses"]
     lines = [
         f"{summary['periods']} periods, {share:.2f} % answered in time, {misses} deadline misses"
     ]
     if "tracking" in summary:
-        told = summary["tracking"]
-        lines.append(f"tracking (truth): MLE {told['mle']:.3f} m, ALE {told['ale']:.3f} m")
+        errors = summary["tracking"]
+        lines.append(f"tracking (truth): MLE {errors['mle']:.3f} m, ALE {errors['ale']:.3f} m")
     if summary.get("estimation"):
-        told = summary["estimation"]
+        values = summary["estimation"]
         lines.append(
-            f"estimate: position error rms {told['position_rms']:.3f} m, "
-            f"max {told['position_max']:.3f} m; {told['fixes_used']} fixes used, "
-            f"{told['fixes_refused']} refused; {told['readings_refused']} readings refused; "
-            f"{told['samples_lost']} samples lost"
+            f"estimate: position error rms {values['position_rms']:.3f} m, "
+            f"max {values['position_max']:.3f} m; {values['fixes_used']} fixes used, "
+            f"{values['fixes_refused']} refused; {values['readings_refused']} readings refused; "
+            f"{values['samples_lost']} samples lost"
         )
     found = summary["faults"]
     if found["stale_brakings"]:
@@ -195,13 +66,105 @@ def sentences(summary: Summary) -> list[str]:
             f"first at {first['began']:.3f} s, {first['age_periods']:.2f} periods "
             f"(of {STALE_PERIODS}) after the last good sample"
         )
-    asked = {name: count for name, count in found["commands_to_brake"].items() if count}
-    if asked:
-        told = ", ".join(f"{count} for {name}" for name, count in asked.items())
-        lines.append(f"commands to brake: {told}")
+    brakings = {name: count for name, count in found["commands_to_brake"].items() if count}
+    if brakings:
+        words = ", ".join(f"{count} for {name}" for name, count in brakings.items())
+        lines.append(f"commands to brake: {words}")
     stop = summary["stop"]
     lines.append(
         f"end: {summary['end']}; then stopped in {stop['distance']:.1f} m and "
         f"{stop['seconds']:.1f} s (simulated), at {stop['final_speed']:.2f} m/s"
     )
     return lines
+
+
+def draw(setup: Setup, outcome: Outcome, summary: Summary, path: ReferencePath) -> Figure | None:
+    """Draw four panels; None for a run that never began."""
+    recording = outcome.recording
+    if len(recording.rows) < 2:
+        return None
+    driven = recording.driven()
+    figure = Figure(figsize=(13.0, 8.5), layout="constrained")
+    panels = figure.subplots(2, 2)
+    _latencies(panels[0, 0], setup, recording)
+    _distribution(panels[0, 1], setup, recording)
+    _errors(panels[1, 0], outcome, driven)
+    _map(panels[1, 1], recording, driven, path)
+    figure.suptitle(
+        f"lpv-track run-parallel: {setup.agent} on {setup.trajectory}, {setup.estimator}, "
+        f"{setup.conditions_name}; {summary['rate']:.2f} of {setup.rate} Hz, "
+        f"{summary['deadline_misses']} deadline misses; end: {outcome.end}"
+    )
+    return figure
+
+
+def _latencies(ax: Axes, setup: Setup, recording: Recording) -> None:
+    applied = recording.applied()
+    time = applied["period"] * setup.period
+    for name, label, colour in (
+        ("latency", "applied", COLOURS[0]),
+        ("commanded", "command written", COLOURS[1]),
+        ("estimated", "estimate written", COLOURS[2]),
+    ):
+        ax.plot(time, 1e3 * applied[name], ".", markersize=2, label=label, color=colour)
+    ax.axhline(1e3 * setup.period, color="black", linewidth=0.8, label="control period")
+    ax.set_yscale("log")
+    _plain(ax.yaxis)
+    ax.set_xlabel("time, s")
+    ax.set_ylabel("ms after the sample was due")
+    ax.legend(fontsize="small", markerscale=4)
+    ax.grid(visible=True, alpha=0.3)
+
+
+def _distribution(ax: Axes, setup: Setup, recording: Recording) -> None:
+    applied = recording.applied()
+    for name, label, colour in (
+        ("latency", "wake-to-action", COLOURS[0]),
+        ("solve_time", "solve", COLOURS[1]),
+    ):
+        values = np.sort(1e3 * applied[name][applied[name] > 0.0])
+        if values.size:
+            beyond = 1.0 - np.arange(values.size) / values.size
+            ax.step(values, beyond, where="post", label=label, color=colour)
+    ax.axvline(1e3 * setup.period, color="black", linewidth=0.8, label="control period")
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    _plain(ax.xaxis)
+    _plain(ax.yaxis)
+    ax.set_xlabel("ms")
+    ax.set_ylabel("share of periods that took longer")
+    ax.legend(fontsize="small")
+    ax.grid(visible=True, alpha=0.3)
+
+
+def _plain(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers, at powers of ten only."""
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _errors(ax: Axes, outcome: Outcome, driven: Driven) -> None:
+    ax.plot(driven.time, driven.lateral_error, color=COLOURS[0], linewidth=1.0)
+    ax.set_xlabel("time, s")
+    ax.set_ylabel("lateral error (truth), m")
+    for one in outcome.stale_brakings:
+        ended = driven.time[-1] if one.ended is None else one.ended
+        ax.axvspan(one.began, ended, color=COLOURS[3], alpha=0.3)
+    speed = ax.twinx()
+    speed.plot(driven.time, driven.state[:, VX], color=COLOURS[1], linewidth=0.8)
+    speed.set_ylabel("speed, m/s", color=COLOURS[1])
+    ax.grid(visible=True, alpha=0.3)
+
+
+def _map(ax: Axes, recording: Recording, driven: Driven, path: ReferencePath) -> None:
+    ax.plot(path.x, path.y, color="lightgrey", linewidth=3.0, label="path")
+    ax.plot(driven.state[:, X], driven.state[:, Y], color=COLOURS[0], linewidth=1.0, label="driven")
+    estimates = np.array([one["state"] for one in recording.estimates.values()])
+    if estimates.size:
+        ax.plot(
+            estimates[:, X], estimates[:, Y], ".", color=COLOURS[1], markersize=1, label="estimated"
+        )
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_xlabel("X, m")
+    ax.set_ylabel("Y, m")
+    ax.legend(fontsize="small", markerscale=6)

@@ -1,9 +1,16 @@
-"""What a parallel run is made of, the same for all its processes."""
+"""Settings of a parallel run and the messages between its processes.
+
+Messages are numpy records in SI units; NaN stands for a quantity that was not measured. Times named
+`taken` are in ns of `time.monotonic_ns()`, a clock that all processes share: the instant at which
+the sample behind a message was due.
+"""
 
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
+
+import numpy as np
 
 import agents
 import trajectories
@@ -14,25 +21,85 @@ from lpv_track_env.env import PathTrackingEnv
 from trajectories.naming import choose
 
 MS = 1_000_000
-"""ns."""
+"""Nanoseconds per millisecond."""
 MS_PER_SECOND = 1000
 STEP = 1.0 / MS_PER_SECOND
-"""s: the simulated vehicle's cycle, in which it is integrated and commands take effect."""
+"""Cycle of the simulated vehicle, s: integration step, and grid on which commands take effect."""
 INERTIAL_MS, WHEEL_MS = 10, 20
-"""Time between readings, ms: IMU and heading at 100 Hz, wheels at 50 Hz. Fixes: see conditions."""
+"""Time between readings, ms: IMU and heading at 100 Hz, wheels at 50 Hz."""
 PREVIEW_PERIOD, PREVIEW_STEPS = 0.05, 20
-"""s and nodes: agents look one second ahead, whatever the rate."""
+"""Preview of agents, s and nodes: one second ahead, whatever the rate."""
 ESTIMATORS = ("ekf", "truth")
+
+SAMPLE = np.dtype(
+    [
+        ("period", np.int64),  # number of its control period, from 0
+        ("taken", np.int64),
+        ("time", np.float64),  # s on the vehicle's clock
+        ("mean_acceleration", np.float64),  # reported by the actuators, mean since the last
+        ("mean_steering_angle", np.float64),  # sample: m/s^2, rad
+        ("acceleration", np.float64),  # in force now
+        ("steering_angle", np.float64),
+        ("heading", np.float64),  # rad
+        ("yaw_rate", np.float64),  # rad/s
+        ("speed", np.float64),  # of the wheels, m/s
+        ("fix_time", np.float64),  # s on the vehicle's clock, when the position was measured
+        ("fix_x", np.float64),  # m
+        ("fix_y", np.float64),
+        ("truth", np.float64, (6,)),  # [vx, vy, psi, r, X, Y], for `--estimator truth` alone
+    ]
+)
+"""Message from the vehicle to the estimator."""
+
+ESTIMATE = np.dtype(
+    [
+        ("period", np.int64),
+        ("taken", np.int64),  # of the newest sample in it
+        ("time", np.float64),
+        ("state", np.float64, (6,)),  # [vx, vy, psi, r, X, Y]
+        ("acceleration", np.float64),  # in force at that time
+        ("steering_angle", np.float64),
+        ("position_deviation", np.float64),  # m, standard deviation in the worst direction
+        ("fix_age", np.float64),  # s since the last fix that was used
+        ("steering_offset", np.float64),  # rad, angle of the wheels minus the reported one
+        ("fixes_used", np.int64),
+        ("fixes_refused", np.int64),  # gated, late, duplicate or not finite
+        ("readings_refused", np.int64),  # gated or not finite
+        ("samples_lost", np.int64),  # overwritten before they were read
+    ]
+)
+"""Message from the estimator to the controller (and to the run's report)."""
+
+COMMAND = np.dtype(
+    [
+        ("period", np.int64),
+        ("taken", np.int64),  # of the estimate that it answers
+        ("estimated", np.int64),  # when that estimate was written
+        ("acceleration", np.float64),  # m/s^2
+        ("steering_angle", np.float64),  # rad
+        ("solve_time", np.float64),  # of the agent's `predict`, s; 0 if it was not called
+        ("reason", np.int64),  # DRIVING, or why the controller brakes
+        ("failures", np.int64),  # calls of `predict` that failed, so far
+    ]
+)
+"""Message from the controller to the vehicle."""
+
+DRIVING, STALE_ESTIMATE, NO_FIX, NOT_FINITE, FAILED = range(5)
+REASONS = ("driving", "stale estimate", "no fix", "estimate not finite", "failed solve")
+"""Reasons for a command, by code: all but `DRIVING` brake."""
+
+STALE_PERIODS = 3
+"""Age in control periods at which an estimate, or a command based on it, is stale."""
 
 
 def undelayed(conditions: Conditions) -> Conditions:
-    """Conditions without the computing delay that the processes of a run really have."""
+    """Remove the simulated computing delay: the processes of a run have a real one."""
     return conditions.replace(computing_delay=0.0)
 
 
 @dataclass(frozen=True)
 class Setup:
-    """A run's settings; it is handed to the processes.
+    """Settings of a run, passed to its processes.
 
     Parameters
     ----------
@@ -41,15 +108,15 @@ class Setup:
     rate
         Control rate, Hz; a divisor of 1000.
     seconds
-        Length of the run, s; it ends before that where the path does.
+        Length of the run, s; it ends earlier if the path does.
     conditions
-        Of sensors, actuators and vehicle: what `lpv_track_env.conditions.load` knows.
+        Conditions of sensors, actuators and vehicle, as `lpv_track_env.conditions.load` takes them.
     estimator
-        "ekf", or "truth": what the vehicle really does is passed on as the estimate.
+        "ekf", or "truth": the true state is passed on as the estimate.
     seed
-        Of the sensors' noise.
+        Seed of the sensors' noise.
     watchdog
-        Control periods without a new command after which the silent process is taken for hung.
+        Control periods without a new command after which the silent process counts as hung.
 
     Raises
     ------
@@ -113,7 +180,7 @@ class Setup:
 
     @property
     def conditions_name(self) -> str:
-        """The conditions in words."""
+        """Conditions in words."""
         if isinstance(self.conditions, str):
             return self.conditions
         return ", ".join(
@@ -123,20 +190,19 @@ class Setup:
 
     @property
     def known_conditions(self) -> Conditions:
-        """The conditions themselves."""
+        """Conditions as an object, `IDEAL` for the simulation."""
         return load(self.conditions) or IDEAL
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         return asdict(self)
 
     def task_env(self) -> PathTrackingEnv:
-        """What an agent is made for: path, vehicle, control period, preview, known delays."""
+        """Return an environment with the path, vehicle, period, preview and known delays."""
         conditions = load(self.conditions)
         return PathTrackingEnv(
             self.trajectory,
             self.vehicle,
-            # Computing takes the time that it really takes, which is next to nothing.
             conditions="simulation" if conditions is None else undelayed(conditions),
             control_period=self.period,
             preview_steps=PREVIEW_STEPS,
@@ -144,5 +210,5 @@ class Setup:
         )
 
     def make_agent(self, env: PathTrackingEnv) -> agents.Agent:
-        """The agent that drives."""
+        """Return the agent that drives."""
         return agents.make(self.agent, env, **self.agent_settings)

@@ -10,7 +10,6 @@ import numpy as np
 from experiments.parallel.control import control
 from experiments.parallel.estimation import estimate
 from experiments.parallel.mailbox import Mailbox, Message, Reader
-from experiments.parallel.messages import COMMAND, ESTIMATE, SAMPLE, STALE_PERIODS
 from experiments.parallel.processes import (
     ATTACHED,
     READY,
@@ -21,9 +20,16 @@ from experiments.parallel.processes import (
     wait_until,
 )
 from experiments.parallel.recording import Outcome, Recording
-from experiments.parallel.sensors import Sensors
-from experiments.parallel.setup import MS, MS_PER_SECOND, Setup
-from experiments.parallel.vehicle import Vehicle
+from experiments.parallel.setup import (
+    COMMAND,
+    ESTIMATE,
+    MS,
+    MS_PER_SECOND,
+    SAMPLE,
+    STALE_PERIODS,
+    Setup,
+)
+from experiments.parallel.vehicle import Sensors, Vehicle
 
 START_TIMEOUT = 180.0
 """s until both processes must be ready: importing, and compiling where numba's cache is empty."""

@@ -1,42 +1,52 @@
-"""The simulated vehicle and its drive-by-wire interface, which brakes when nobody drives it."""
+"""The simulated vehicle: plant, drive-by-wire interface that brakes by itself, and sensors."""
 
 import math
+from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import stopping_acceleration
-from experiments.parallel.messages import STALE_PERIODS
-from experiments.parallel.setup import MS_PER_SECOND, STEP, Setup, undelayed
-from lpv_track_env.bicycle import VX
-from lpv_track_env.conditions import SIMULATION, Conditions, load
+from experiments.parallel.setup import (
+    INERTIAL_MS,
+    MS_PER_SECOND,
+    STALE_PERIODS,
+    STEP,
+    WHEEL_MS,
+    Setup,
+    undelayed,
+)
+from lpv_track_env import sensors
+from lpv_track_env.bicycle import PSI, VX, YAW_RATE, X, Y
+from lpv_track_env.conditions import IDEAL, SIMULATION, Conditions, load
 from lpv_track_env.env import PathTrackingEnv
 
 Array = NDArray[np.float64]
 
 CORRIDOR = 5.0
-"""m: a vehicle this far from the path has left it."""
+"""Lateral error at which the vehicle has left the corridor, m."""
 STANDSTILL = 0.01
-"""m/s."""
+"""Speed that counts as standing, m/s."""
 LONGEST_STOP = 60.0
-"""s of simulated time that a stop may take."""
+"""Largest simulated time of a stop, s."""
 FOR_EVER = 1e9
-"""s."""
+"""Age limit that is never reached, s."""
 
 
 @dataclass
 class StaleBraking:
-    """One time that the vehicle braked because it was left alone; times on its clock, s."""
+    """A phase of braking for lack of fresh commands; times on the vehicle's clock, s."""
 
     began: float
     age: float
-    """Of the estimate behind the last command, when it began."""
+    """Age of the estimate behind the last command at the beginning."""
     ended: float | None = None
 
 
 def plant_conditions(setup: Setup) -> Conditions | str:
-    """A run's conditions as far as they are the vehicle's: sensors and computers are elsewhere."""
+    """Return the run's conditions of the vehicle alone, without sensors and computing delay."""
     conditions = load(setup.conditions)
     if conditions is None:
         return SIMULATION
@@ -46,27 +56,27 @@ def plant_conditions(setup: Setup) -> Conditions | str:
 
 
 class Vehicle:
-    """The project's plant in steps of 1 ms, driven by the latest command.
+    """The environment's plant in steps of 1 ms, driven by the latest command.
 
-    A command counts until the estimate that it answers is three control periods old on the
-    vehicle's own clock (the command itself is younger). Then the vehicle brakes: steering held,
-    controlled deceleration down to standstill, until there is a command it can trust.
+    A command is valid until the estimate behind it is three control periods old on the vehicle's
+    own clock. Then the vehicle brakes with the steering held, at a controlled deceleration down to
+    standstill, until a valid command arrives.
 
     Parameters
     ----------
     setup
-        The run's.
+        Settings of the run.
     """
 
     def __init__(self, setup: Setup) -> None:
-        # Where it is for a drive to end is decided here, so that it can still brake afterwards.
+        # The corridor is checked in `end`, so that the vehicle can still brake after leaving it.
         self.env = PathTrackingEnv(
             setup.trajectory, setup.vehicle, conditions=plant_conditions(setup),
             control_period=STEP, max_lateral_error=1000.0,
             time_limit=2.0 * setup.seconds + LONGEST_STOP,
         )  # fmt: skip
         self.env.reset(seed=setup.seed)
-        # A first step has code loaded or compiled, for which there is no time while driving.
+        # The first step loads or compiles code, which would be too slow while driving.
         self.env.step([0.0, 0.0])  # type: ignore[arg-type]
         _, self.info = self.env.reset(seed=setup.seed)
         self._steps = 0
@@ -81,7 +91,7 @@ class Vehicle:
 
     @property
     def in_force(self) -> tuple[float, float]:
-        """Acceleration (m/s^2) and steering angle (rad) that the actuators report."""
+        """Acceleration (m/s^2) and steering angle (rad) reported by the actuators."""
         return self.env.actuators
 
     @property
@@ -91,7 +101,7 @@ class Vehicle:
 
     @property
     def age(self) -> float:
-        """Age of what the command in force answers, s."""
+        """Age of the estimate behind the command in force, s."""
         return self.time - self._answered
 
     @property
@@ -101,15 +111,15 @@ class Vehicle:
 
     @property
     def end(self) -> str | None:
-        """Why the drive cannot go on: finished, left_corridor, wrong_heading, non_finite."""
+        """Why the drive ends: finished, left_corridor, wrong_heading or non_finite; else None."""
         if "end" in self.info:
             return str(self.info["end"])
         return "left_corridor" if abs(self.info["lateral_error"]) > CORRIDOR else None
 
     def take(self, acceleration: float, steering_angle: float, answered: float) -> bool:
-        """Take a command that answers what was sensed at `answered` (s); whether it was taken.
+        """Take a command based on the sample of time `answered` (s); return whether it is valid.
 
-        One that is not finite is not: then the vehicle goes on with the last, and soon brakes.
+        A command that is not finite is refused: the vehicle keeps the last one, and soon brakes.
         """
         if not (math.isfinite(acceleration) and math.isfinite(steering_angle)):
             self.commands_refused += 1
@@ -119,7 +129,7 @@ class Vehicle:
         return True
 
     def advance(self, until: float) -> None:
-        """Drive all steps that begin before `until` (s), braking in those that are left alone."""
+        """Advance by all steps that begin before `until` (s), braking if the command is stale."""
         steps = math.ceil(until * MS_PER_SECOND - 1e-6)
         while self._steps < steps and "end" not in self.info:
             if self.age > self._stale_after - 0.5 * STEP:
@@ -140,7 +150,7 @@ class Vehicle:
         self._summed += 1
 
     def mean_inputs(self) -> tuple[float, float]:
-        """Mean inputs in force since this was last asked, m/s^2 and rad."""
+        """Return the mean inputs in force since the last call, m/s^2 and rad."""
         if self._summed == 0:
             return self.in_force
         a, delta = self._sums / self._summed
@@ -149,9 +159,9 @@ class Vehicle:
         return float(a), float(delta)
 
     def stop(self) -> tuple[float, float]:
-        """Brake to standstill, simulated at once: time (s) and distance (m) that it took.
+        """Simulate braking to standstill at once; return its time (s) and distance (m).
 
-        It ends early where the path does.
+        It ends early if the path does.
         """
         began, start = self._steps, self.info["arc_length"]
         self._command[1] = self.in_force[1]
@@ -163,3 +173,51 @@ class Vehicle:
             self._command[0] = stopping_acceleration(self.env.vehicle, self.speed)
             self._step()
         return (self._steps - began) * STEP, self.info["arc_length"] - start
+
+
+class Sensors:
+    """Sensors of the vehicle, each at its own rate, with the errors of `lpv_track_env.sensors`.
+
+    Parameters
+    ----------
+    conditions
+        Conditions of the sensors; None for perfect ones.
+    fix_ms
+        Time between fixes, ms.
+    seed
+        Seed of all draws.
+    """
+
+    def __init__(self, conditions: Conditions | None, fix_ms: int, seed: int) -> None:
+        self.conditions = conditions or IDEAL
+        self._sensors = sensors.Sensors(self.conditions, seed)
+        self._latency = self._sensors.drawn["gnss_latency"]
+        self._fix_ms = fix_ms
+        self._coming: deque[tuple[int, float, float, float]] = deque()
+        """Fixes on their way: arrival (ms), stamp (s), x and y (m)."""
+
+    def read(self, ms: int, state: Array, record: Any) -> None:
+        """Write the readings at time `ms` into a SAMPLE record, NaN where a sensor has none."""
+        time = ms / MS_PER_SECOND
+        for name in ("heading", "yaw_rate", "speed", "fix_time", "fix_x", "fix_y"):
+            record[name] = math.nan
+        if ms % INERTIAL_MS == 0:
+            record["heading"], record["yaw_rate"] = self._sensors.inertial(
+                time, state[PSI], state[YAW_RATE]
+            )
+        if ms % WHEEL_MS == 0:
+            record["speed"] = self._sensors.wheel_speed(state[VX])
+        if ms % self._fix_ms == 0:
+            self._measure_fix(ms, time, state)
+        if self._coming and self._coming[0][0] <= ms:
+            _, record["fix_time"], record["fix_x"], record["fix_y"] = self._coming.popleft()
+
+    def _measure_fix(self, ms: int, time: float, state: Array) -> None:
+        """Queue a fix of this moment unless it is lost; the first fix arrives at once."""
+        if ms == 0:
+            self._coming.append((ms, time, *self._sensors.first_fix(state[X], state[Y])))
+            return
+        fix = self._sensors.fix(time, state[X], state[Y])
+        if fix is not None:
+            arrives = ms + math.ceil(MS_PER_SECOND * self._latency - 1e-6)
+            self._coming.append((arrives, time, *fix))

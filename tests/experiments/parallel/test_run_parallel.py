@@ -16,9 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.parallel import control, report
-from experiments.parallel.command import verdict
-from experiments.parallel.messages import (
+from experiments.commands.run_parallel import verdict
+from experiments.parallel import control
+from experiments.parallel.processes import Child, Link, Stop
+from experiments.parallel.recording import COMPLETE, Outcome, Recording, summarise, timing
+from experiments.parallel.setup import (
     COMMAND,
     DRIVING,
     ESTIMATE,
@@ -27,13 +29,10 @@ from experiments.parallel.messages import (
     NOT_FINITE,
     SAMPLE,
     STALE_ESTIMATE,
+    Setup,
 )
-from experiments.parallel.processes import Child, Link, Stop
-from experiments.parallel.recording import Outcome, Recording
-from experiments.parallel.sensors import Sensors
-from experiments.parallel.setup import Setup
 from experiments.parallel.supervisor import run
-from experiments.parallel.vehicle import Vehicle
+from experiments.parallel.vehicle import Sensors, Vehicle
 from lpv_track_env import conditions
 from lpv_track_env.vehicle import VEHICLES
 from tests.helpers import faulty_agents
@@ -126,7 +125,7 @@ def test_a_run_to_its_end() -> None:
     driven = outcome.recording.driven()
     assert np.abs(driven.lateral_error).max() < 0.5
     assert driven.arc_length[-1] > 0.5 * driven.state[0, 0]
-    summary = report.summarise(SLOW, outcome)
+    summary = summarise(SLOW, outcome)
     assert summary["periods"] == 20
     assert summary["complete"]
     assert json.dumps(summary, allow_nan=False)
@@ -140,7 +139,7 @@ def test_a_killed_process_brakes_the_vehicle_and_ends_the_run(role: str, capsys)
     assert outcome.end == "fault"
     assert outcome.fault == f"the {role} was killed by SIGKILL"
     assert_braked_in_time(setup, outcome)
-    summary = report.summarise(setup, outcome)
+    summary = summarise(setup, outcome)
     assert verdict(outcome, summary) == 1
     assert capsys.readouterr().err == f"lpv-track: the {role} was killed by SIGKILL\n"
 
@@ -179,7 +178,7 @@ def wait_for_the_end(pids: Iterator[int]) -> None:
 
 def test_sigterm_brakes_first_and_ends_all(tmp_path: Path) -> None:
     process, pids, own = started("--out", str(tmp_path))
-    time.sleep(0.5)
+    time.sleep(1.5)
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=30.0)
     assert process.returncode == 128 + signal.SIGTERM
@@ -476,7 +475,7 @@ def test_deadlines_and_latencies_of_a_run_by_hand() -> None:
     recording.rows = [(0.0,)] * 6  # Five periods.
     for period, latency in ((0, 0.004), (1, 0.006), (2, 0.021), (4, 0.005), (4, 0.012)):
         recording.commands.append((period, latency, 0.001, 0.003, 0.0005, DRIVING, 0))
-    told = report.timing(setup, recording)
+    told = timing(setup, recording)
     assert told["periods"] == 5
     assert told["answered_in_time"] == 3  # 2 came too late, 3 not at all, 4 twice.
     assert told["deadline_misses"] == 2
@@ -504,7 +503,7 @@ def test_the_exit_code_tells_how_it_went(
     end: str, fault: str, number: int, held: bool, code: int, said: str, capsys
 ) -> None:
     outcome = Outcome(end, fault, number, Recording(), [], (0.0, 0.0), 0.0, 0)
-    complete = end in report.COMPLETE
+    complete = end in COMPLETE
     summary = {"complete": complete, "held": held, "deadline_misses": 5, "periods": 10}
     assert verdict(outcome, summary) == code
     assert capsys.readouterr().err.startswith(f"lpv-track: {said}" if said else "")

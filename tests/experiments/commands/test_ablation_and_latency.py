@@ -8,7 +8,8 @@ import matplotlib.image as mpimg
 import pytest
 
 from experiments import cli
-from experiments.realtime import ablation, latency
+from experiments.commands import ablation
+from experiments.parallel import latency
 from experiments.run.computing import ARRANGEMENTS
 from lpv_track_env.conditions import DRAWN, REALTIME
 
@@ -32,7 +33,7 @@ def test_ablation(
     shown = capsys.readouterr().out
     result = json.loads((tmp_path / "ablation.json").read_text())
     rows = {(row["row"], row["compensated"]): row for row in result["rows"]}
-    labels = ["none", *kept, "all: realtime", *ablation.WITHOUT_FILTER]
+    labels = ["none", *kept, "all: realtime", *ablation.ALL_BUT]
     assert list(rows) == [(label, flag) for label in labels for flag in (True, False)]
     assert all(row["episodes"] == 2 for row in rows.values())
     # Nothing to compensate where nothing is late.
@@ -97,7 +98,7 @@ def test_no_table_of_what_is_left_where_cases_failed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ablation, "GROUPS", {})
-    monkeypatch.setattr(ablation, "WITHOUT_FILTER", {})
+    monkeypatch.setattr(ablation, "ALL_BUT", {})
     faulty = tmp_path / "faulty.py"
     faulty.write_text(
         "class Faulty:\n"

@@ -1,11 +1,12 @@
-"""`lpv-track latency`: estimation and control in sequence or in parallel, what it does to a drive.
+"""Estimation and control in sequence or in parallel, and the effect on tracking, by simulation.
 
 kumar2025lpv runs both in parallel processes to cut latency and gives no figure (errata, 9). Here
-times of this project's filter and solvers are recorded, every period's are drawn from them, and
-they become delays of a vehicle in real-time conditions. What parallel processes change is how often
-a command can be made: a computation in sequence that takes longer than a period misses every
-second one, or is given a slower clock. How old a command's readings are does not get better by it;
-with clocks of their own it gets worse.
+computing times of this project's filter and solvers are recorded. Each control period draws its
+times from these records, and they delay the commands of a vehicle in real-time conditions.
+
+Parallel processes change how often a command can be computed: in sequence, a computation that takes
+longer than a period misses every second one, or needs a slower clock. They do not make the readings
+behind a command any fresher; with a clock for each process the readings get older.
 """
 
 import json
@@ -34,24 +35,24 @@ from trajectories.fileio import write_atomically
 Spec = dict[str, Any]
 
 PERIOD = 0.02
-"""s: 50 Hz, the paper's."""
+"""Control period of the paper (50 Hz), s."""
 ENV = {"preview_period": 0.05}
 AGENT = "lpv-nmpc"
 SOLVERS = ("lpv-nmpc", "lpv-nmpc-ipopt")
 MAILBOX = 1e-4
-"""s from process to process, as `lpv-track run-parallel --bench-mailbox` measures it."""
+"""Time from process to process, s, as `lpv-track run-parallel --bench-mailbox` measures it."""
 SHARES = (0.5, 1.0, 1.5, 1.9)
-"""Mean computing time by the period, of slower computers; half of it the estimator's."""
+"""Mean computing times of slower computers over the period; half is the estimator's."""
 RECORDED_STEPS = 400
 SLOWER_CLOCK = "sequential, slower clock"
-"""One process that is not asked for more than it can do: so many periods to a command that"""
+"""One process whose period is long enough for most computations."""
 KEPT = 0.95
-"""of all computations this share end within them."""
+"""Share of computations that end within the period of the slower clock."""
 COLUMNS = (ARRANGEMENTS[0], SLOWER_CLOCK, *ARRANGEMENTS[1:])
 
 
 def record(trajectory: str, steps: int = RECORDED_STEPS) -> dict[str, list[float]]:
-    """Measure the filter and the solvers here: quantiles of times, s, by name."""
+    """Measure filter and solvers on this machine; return quantiles of their times, s, by name."""
     recorded = {"ekf": quantiles(filter_times(steps))}
     for name in SOLVERS:
         case = Case(
@@ -60,19 +61,18 @@ def record(trajectory: str, steps: int = RECORDED_STEPS) -> dict[str, list[float
         )  # fmt: skip
         env = case.make_env()
         driven = rollout(env, case.make_agent(env), seed=0)
-        # Without the first solve, which starts cold.
+        # The first solve has no warm start.
         recorded[name] = quantiles(driven.trace.solve_time[2:])
         env.close()
     return recorded
 
 
 def filter_times(steps: int) -> list[float]:
-    """Times of the filter's work in a period: prediction, readings, and a fix 0.1 s late, s."""
+    """Return times (s) of the filter's work in a period: prediction, readings, a fix 0.1 s late."""
     estimator = Estimator(VEHICLES["m2-minibus"], period=PERIOD)
     times: list[float] = []
     for _ in range(2):
-        # The second time everything is compiled.
-        times.clear()
+        times.clear()  # The first run compiles.
         estimator.begin(0.0, 0.0, 0.0, 0.0, 8.0)
         for k in range(1, steps + 1):
             now = k * PERIOD
@@ -85,7 +85,7 @@ def filter_times(steps: int) -> list[float]:
 
 
 def loads(recorded: Mapping[str, Sequence[float]]) -> dict[str, dict[str, Any]]:
-    """Times of estimator and controller of each row, arguments of `ComputingTimes`."""
+    """Return the times of estimator and controller of each row, arguments of `ComputingTimes`."""
     rows: dict[str, dict[str, Any]] = {
         f"measured: ekf, {name}": {"estimation": recorded["ekf"], "control": recorded[name]}
         for name in SOLVERS
@@ -103,7 +103,7 @@ def loads(recorded: Mapping[str, Sequence[float]]) -> dict[str, dict[str, Any]]:
 def specs_of(
     recorded: Mapping[str, Sequence[float]], trajectories: Sequence[str], seeds: Sequence[int]
 ) -> dict[tuple[str, str], list[Spec]]:
-    """Cases by row and arrangement; the agent knows the mean latency of each."""
+    """Return the cases of each row and arrangement; the agent knows the mean latency."""
     cells = {}
     for label, times in loads(recorded).items():
         for arrangement in ARRANGEMENTS:
@@ -140,7 +140,7 @@ def compare(
     workers: int,
     console: Console,
 ) -> int:
-    """Record times (or read them), drive all rows, print the table, write JSON and picture."""
+    """Record or read times, drive all rows, print the table, write JSON and figure; exit code."""
     kept = folder / "times.json"
     recorded = read_times(times or kept) if times is not None or kept.exists() else None
     if recorded is None:
@@ -155,7 +155,7 @@ def compare(
     }  # fmt: skip
     store = run_benchmark(specs, folder, workers=workers, settings=settings, console=console)
     if print_failed(selected(store, specs), console):
-        # A table of what is left would compare unlike things; the same command tries them again.
+        # Means without the failed cases would not be comparable.
         return 1
     rows = [
         {"row": label, "arrangement": arrangement, **summary(selected(store, cell))}
@@ -175,12 +175,12 @@ def compare(
 
 
 def read_times(file: Path) -> dict[str, list[float]]:
-    """Recorded times as a run before has written them.
+    """Read times that an earlier run has recorded.
 
     Raises
     ------
     ValueError
-        If the file holds something else.
+        If the file does not hold recorded times.
     """
     try:
         recorded: dict[str, list[float]] = json.loads(file.read_text(encoding="utf-8"))
@@ -192,7 +192,7 @@ def read_times(file: Path) -> dict[str, list[float]]:
 
 
 def summary(cases: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Latencies (s), share of missed periods, tracking, over the episodes of a cell."""
+    """Return latencies (s), share of missed periods and errors over the episodes of a cell."""
     ale, mle = (estimate([case["metrics"][key] for case in cases]) for key in ("ale", "mle"))
     periods = [case["metrics"]["duration"] / case["control_period"] for case in cases]
     return {
@@ -212,7 +212,7 @@ def summary(cases: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def table(result: Mapping[str, Any]) -> Table:
-    """A line per row and arrangement."""
+    """Return the console's table, a line per row and arrangement."""
     paths = ", ".join(result["trajectories"])
     shown = Table(
         title=f"{AGENT} at {1 / PERIOD:.0f} Hz on {paths}, {len(result['seeds'])} seeds",

@@ -1,4 +1,0 @@
-"""Experiments on the conditions of a real vehicle: what each costs, and what computing time does.
-
-`ablation` and `latency` are commands of `lpv-track`.
-"""
