@@ -11,17 +11,16 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from lpv_track_env import episodes, kernels, plants
-from lpv_track_env.actions import check_finite, two_numbers
 from lpv_track_env.conditions import Actuation, Conditions
 from lpv_track_env.conditions import episode as conditions_episode
 from lpv_track_env.conditions import load as load_conditions
 from lpv_track_env.conditions.layout import ConditionsArrays
 from lpv_track_env.draws import random_key
-from lpv_track_env.episodes import given_start
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.plants.episode import PlantEpisode
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.task import Task, action_space, checked_period, reference
+from lpv_track_env.validation import check_finite, given_start, two_numbers
 from lpv_track_env.vector_infos import single_info
 from lpv_track_env.vehicle import VehicleParameters
 from lpv_track_env.vehicle import load as load_vehicle

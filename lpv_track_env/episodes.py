@@ -5,10 +5,8 @@ how many environments there are, on which of them reset before, or on what else 
 """
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels
@@ -27,30 +25,6 @@ GIVEN = ("arc_length", "lateral_error", "heading_error", "speed_error")
 
 ROLLING_DECELERATION = 6
 """Index of mu g in the constants."""
-
-
-def given_start(options: Mapping[str, Any], length: float) -> NDArray[np.float64]:
-    """Start that reset options ask for, (4,) in the order of `GIVEN`, NaN where they do not.
-
-    Raises
-    ------
-    ValueError
-        For a value that is not a finite number, or an arc length outside of the path.
-    """
-    start = np.full(len(GIVEN), math.nan)
-    for k, key in enumerate(GIVEN):
-        if key not in options:
-            continue
-        try:
-            value = float(options[key])
-        except (TypeError, ValueError):
-            value = math.nan
-        if not math.isfinite(value):
-            raise ValueError(f"reset option {key} must be a finite number, not {options[key]!r}")
-        if key == "arc_length" and not 0.0 <= value <= length:
-            raise ValueError(f"option arc_length must be in [0, {length:.2f}] m, not {value}")
-        start[k] = value
-    return start
 
 
 @compiled_internal

@@ -302,3 +302,18 @@ def start(record: Array, constants: Array, table: Array, observation: Array) -> 
     index, u = locate(record, constants, table, near, 0.0, window)
     record[START] = record[ARC_LENGTH]
     observe(record, constants, table, observation, index, u)
+
+
+@compiled
+def first_not_finite(commands: Array, ends: Array, skips_ended: bool) -> int:
+    """Index into the flat `commands` (n, 2) of the first that is not finite, or -1.
+
+    `skips_ended` leaves out environments whose episode has ended, by their codes `ends` (n,).
+    """
+    for i in range(commands.shape[0]):
+        if skips_ended and ends[i] != RUNNING:
+            continue
+        for j in range(2):
+            if not math.isfinite(commands[i, j]):
+                return 2 * i + j
+    return -1

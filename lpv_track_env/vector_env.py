@@ -1,9 +1,9 @@
 """Many path tracking environments stepped at once, in compiled code."""
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,25 +13,34 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels, vector_kernels
-from lpv_track_env.conditions import Conditions
-from lpv_track_env.conditions.vector import ConditionsVector
+from lpv_track_env.conditions import Conditions, layout
 from lpv_track_env.draws import random_key
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
-from lpv_track_env.episodes import GIVEN, given_start
+from lpv_track_env.episodes import GIVEN
+from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.plants import BICYCLE
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task, action_space
-from lpv_track_env.threads import checked_threads, shares, using_threads
-from lpv_track_env.vector_checks import (
+from lpv_track_env.validation import (
     checked_actions,
     checked_mask,
     checked_mode,
     checked_seeds,
+    checked_threads,
+    given_start,
     listed,
 )
 from lpv_track_env.vector_infos import episode_infos, final_infos, single_info
+from lpv_track_env.vector_kernels import (
+    ConditionArrays,
+    EnvArrays,
+    StepArrays,
+    shares,
+    using_threads,
+)
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
+from trajectories.compilation import entry_point
 from trajectories.naming import choose
 
 Array = NDArray[Any]
@@ -44,23 +53,10 @@ MODES = {
 }
 
 
-class KernelArrays(NamedTuple):
-    """What the kernels know of n environments: see `kernels` for records and constants."""
-
-    records: Array
-    """(n, RECORD_SIZE)."""
-    observations: Array
-    """(n, size) float32."""
-    ends: Array
-    """(n,) codes of `kernels.END_NAMES`."""
-    cases: Array
-    """(n,) index of each environment's constants and table."""
-    constants: Array
-    """(cases, CONSTANTS_SIZE)."""
-    tables: Array
-    """(nodes, 8), all paths one after another."""
-    rows: Array
-    """(cases, 2), first row of each table and the one after its last."""
+EPISODE = 1
+"""Column of an episode's number in `EnvArrays.draws`."""
+NOT_BEGUN = np.uint64(2**64 - 1)
+"""Number of the episode of an environment without one: the next number is 0."""
 
 
 class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
@@ -172,26 +168,37 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._paths, self._cars = paths, cars
         self._drawn = (0, len(paths), len(cars))
         self.tasks = self._tasks_of(paths, cars)
-        self._conditioned: ConditionsVector | None = None
-        if (given := self._single.conditions) is not None:
-            self._conditioned = ConditionsVector(
-                given, self.num_envs, self._single.control_period, self._threads
-            )
-        self._pack(self.tasks)
         self.single_observation_space = self._single.observation_space
         self.single_action_space = action_space([task.vehicle for task in self.tasks])
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         n, size = self.num_envs, self._single.layout.size
-        self._records = np.zeros((n, kernels.RECORD_SIZE))
-        self._final_records = np.zeros((n, kernels.RECORD_SIZE))
-        self._observations = np.zeros((n, size), dtype=np.float32)
-        self._final_observations = np.zeros((n, size), dtype=np.float32)
-        self._scratch = np.zeros((shares(self._threads), vector_kernels.SCRATCH_SIZE))
-        self._cases = np.zeros(n, dtype=np.int64)
-        self._keys = np.zeros(n, dtype=np.uint64)
-        self._episodes = np.full(n, -1)
-        self._ends = np.zeros(n, dtype=np.int64)
+        draws = np.zeros((n, 2), dtype=np.uint64)
+        draws[:, EPISODE] = NOT_BEGUN
+        nothing, given = np.zeros((0, 0)), self._single.conditions
+        self._arrays = EnvArrays(
+            records=np.zeros((n, kernels.RECORD_SIZE)),
+            observations=np.zeros((n, size), dtype=np.float32),
+            ends=np.zeros(n, dtype=np.int64),
+            cases=np.zeros(n, dtype=np.int64),
+            constants=nothing, tables=nothing, rows=nothing, draws=draws,
+        )  # fmt: skip
+        self._conditions: ConditionArrays | None = None
+        scratch = vector_kernels.SCRATCH_SIZE
+        if given is not None:
+            vehicle_size = layout.vehicle_size(given, self._single.control_period)
+            self._conditions = ConditionArrays(np.zeros((n, vehicle_size)), nothing)
+            scratch = filtering.WORK
+        self._pack(self.tasks)
+        self._step = StepArrays(
+            commands=np.zeros((n, 2)),
+            rewards=np.zeros(n),
+            final_records=np.zeros((n, kernels.RECORD_SIZE)),
+            final_observations=np.zeros((n, size), dtype=np.float32),
+            final_reports=np.zeros((n, len(layout.REPORTED))),
+        )
+        self._scratch = np.zeros((shares(self._threads), scratch))
+        self._advance: Callable[..., Any] | None = None
         self._begun = False
         self._nothing_given = np.full(len(GIVEN), np.nan)
 
@@ -204,9 +211,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         ]
 
     def _pack(self, tasks: list[Task]) -> None:
-        """Put the constants and the tables of all tasks into one array each."""
+        """Put the constants, tables and specs of all tasks into one array each."""
         self._packed = tasks
-        self._constants = np.stack([task.constants() for task in tasks])
         tables = [tasks[0].path.table]
         rows, first = [(0, len(tables[0]))], 0
         for task in tasks[1:]:
@@ -215,30 +221,34 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
                 first += len(tables[-1])
                 tables.append(task.path.table)
             rows.append((first, first + len(tables[-1])))
-        self._tables, self._rows = np.concatenate(tables), np.array(rows)
-        if self._conditioned is not None:
-            self._conditioned.pack(tasks)
+        self._arrays = self._arrays._replace(
+            constants=np.stack([task.constants() for task in tasks]),
+            tables=np.concatenate(tables),
+            rows=np.array(rows),
+        )
+        if self._conditions is not None:
+            specs = [layout.spec_of(task) for task in tasks]
+            self._conditions = self._conditions._replace(specs=np.stack(specs))
 
     def task_of(self, index: int) -> Task:
         """Task of the current episode of environment `index`: its path, its vehicle."""
-        return self._packed[int(self._cases[index])]
+        return self._packed[int(self._arrays.cases[index])]
 
     @property
     def begun(self) -> bool:
-        """Whether every environment has had a reset."""
-        return bool(self._episodes.min() >= 0)
+        """True once every environment has had a reset."""
+        return not (self._arrays.draws[:, EPISODE] == NOT_BEGUN).any()
 
     def copy(self, source: Array, target: Array) -> None:
-        """Make environments `target` (m,) those that `source` (m,) are: state, seeds, disturbances.
+        """Copy environments `source` (m,) onto `target` (m,): state, seeds, disturbances.
 
-        From there on the same actions lead to the same, until the next reset with another seed.
+        Equal actions have equal effects from then on, until the next reset with another seed.
         """
-        for array in (
-            self._records, self._observations, self._ends, self._cases, self._keys, self._episodes,
-        ):  # fmt: skip
+        a = self._arrays
+        for array in (a.records, a.observations, a.ends, a.cases, a.draws):
             array[target] = array[source]
-        if self._conditioned is not None:
-            self._conditioned.vehicles[target] = self._conditioned.vehicles[source]
+        if self._conditions is not None:
+            self._conditions.vehicles[target] = self._conditions.vehicles[source]
 
     @property
     def single(self) -> PathTrackingEnv:
@@ -246,47 +256,40 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         return self._single
 
     @property
-    def arrays(self) -> KernelArrays:
+    def arrays(self) -> EnvArrays:
         """Arrays of the current episodes, not copies, for compiled code that steps them itself."""
-        return KernelArrays(
-            self._records, self._observations, self._ends, self._cases, self._constants,
-            self._tables, self._rows,
-        )  # fmt: skip
+        return self._arrays
 
     @property
-    def condition_arrays(self) -> tuple[Array, Array, Array] | None:
-        """The same of what conditions add: vehicles (n, size), specs (cases, SPEC), draws (n, 2).
-
-        See `conditions_layout`; None under conditions `simulation`.
-        """
-        if self._conditioned is None:
-            return None
-        return self._conditioned.arrays(self._keys, self._episodes)
+    def condition_arrays(self) -> ConditionArrays | None:
+        """Further arrays under conditions, not copies; None for "simulation"."""
+        return self._conditions
 
     @property
     def records(self) -> Array:
         """Records of the current episodes, (n, `kernels.RECORD_SIZE`), to read."""
-        return self._records
+        return self._arrays.records
 
     def info_of(self, index: int) -> Infos:
         """Info of environment `index`, as the single environment gives it, without its end."""
-        info = single_info(self._records[index])
-        if self._conditioned is not None:
-            info.update(self._conditioned.single_info(index))
+        info = single_info(self.records[index])
+        if self._conditions is not None:
+            report = self._conditions.vehicles[index, list(layout.REPORTED)]
+            info.update(layout.single_report(report))
         return info
 
     def final_of(self, index: int) -> tuple[Infos, Array]:
         """Last info and observation of environment `index`, which just ended in SAME_STEP."""
-        record = self._final_records[index]
+        record = self._step.final_records[index]
         info = {**single_info(record), "end": kernels.END_NAMES[int(record[kernels.END])]}
-        if self._conditioned is not None:
-            info.update(self._conditioned.final_info(index))
-        return info, self._final_observations[index].copy()
+        if self._conditions is not None:
+            info.update(layout.single_report(self._step.final_reports[index]))
+        return info, self._step.final_observations[index].copy()
 
     @property
     def state(self) -> Array:
         """True states [vx, vy, psi, r, X, Y], (n, 6), a copy."""
-        return self._records[:, :6].copy()
+        return self.records[:, :6].copy()
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Infos | None = None
@@ -318,104 +321,90 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             super().reset(seed=seed)
         self._take_keys(seeds, mask)
         self._pack_beside(tasks if tasks is not self.tasks else [], mask)
-        if self._conditioned is None:
-            vector_kernels.begin_all(
-                mask, self._records, self._cases, drawn, self._constants, self._tables,
-                self._rows, self._keys, self._episodes, given, self._observations, self._ends,
-            )  # fmt: skip
-        else:
-            self._conditioned.begin(
-                mask, self._keys, self._episodes,
-                (
-                    self._records, self._cases, drawn, self._constants, self._tables, self._rows,
-                    given, self._observations, self._ends,
-                ),
-            )  # fmt: skip
-        infos = episode_infos(self._records, mask)
-        if self._conditioned is not None:
-            infos.update(self._conditioned.infos(mask))
-        return self._observations.copy(), infos
+        vector_kernels.begin_all(mask, self._arrays, self._conditions, drawn, given)
+        return self._arrays.observations.copy(), self._infos(mask)
 
     def _pack_beside(self, extra: list[Task], mask: Array) -> None:
         """Pack the constructor's tasks, `extra` ones, and what unmarked episodes still use."""
         fixed = len(self.tasks)
-        used = sorted({case for case in self._cases[~mask].tolist() if case >= fixed})
+        used = sorted({case for case in self._arrays.cases[~mask].tolist() if case >= fixed})
         if not extra and len(self._packed) == fixed + len(used):
             return
         kept = [self._packed[case] for case in used]
         moved = {case: fixed + len(extra) + k for k, case in enumerate(used)}
-        self._cases[:] = [moved.get(case, min(case, fixed - 1)) for case in self._cases.tolist()]
+        cases = self._arrays.cases
+        cases[:] = [moved.get(case, min(case, fixed - 1)) for case in cases.tolist()]
         self._pack([*self.tasks, *extra, *kept])
 
     def _take_keys(self, seeds: Sequence[int | None], mask: Array) -> None:
         """Give every environment that begins a new key where it is seeded or has none yet."""
+        draws = self._arrays.draws
         for i in np.flatnonzero(mask).tolist():
             seed = seeds[i]
-            if seed is None and self._episodes[i] >= 0:
+            if seed is None and draws[i, EPISODE] != NOT_BEGUN:
                 continue
             source = self.np_random if seed is None else seeding.np_random(seed)[0]
-            self._keys[i] = random_key(source)
-            self._episodes[i] = -1
+            draws[i] = random_key(source), NOT_BEGUN
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
         """Drive one control period; see the class for actions, autoreset, infos and errors."""
         observations, rewards, terminated, truncated = self.advance(actions)
-        infos = episode_infos(self._records)
+        infos = self._infos()
         ended = terminated | truncated
-        if self._conditioned is not None:
-            infos.update(self._conditioned.infos(np.ones(self.num_envs, dtype=np.bool_)))
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            infos.update(final_infos(self._final_records, self._final_observations, ended))
-            if self._conditioned is not None:
-                infos["final_info"].update(self._conditioned.final_infos(ended))
+            last = self._step
+            infos.update(final_infos(last.final_records, last.final_observations, ended))
+            if self._conditions is not None:
+                infos["final_info"].update(layout.reports_infos(last.final_reports, ended))
         return observations, rewards, terminated, truncated, infos
+
+    def _infos(self, mask: Array | None = None) -> Infos:
+        """Infos of the current episodes of the environments that `mask` (n,) marks, or of all."""
+        infos = episode_infos(self.records, mask)
+        if self._conditions is not None:
+            shown = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask
+            reports = self._conditions.vehicles[:, layout.REPORTED]
+            infos.update(layout.reports_infos(reports, shown))
+        return infos
 
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array]:
         """`step` without infos, for those who do not read them."""
         self._check_order()
-        commands = checked_actions(actions, self._ends, self._mode)
-        n = self.num_envs
-        rewards = np.empty(n)
-        if self._conditioned is not None:
-            self._conditioned.advance(
-                self._mode, self._keys, self._episodes,
-                (
-                    self._records, commands, self._cases, self._drawn, self._constants,
-                    self._tables, self._rows, self._nothing_given, self._observations, self._ends,
-                    rewards, self._final_records, self._final_observations,
-                ),
-            )  # fmt: skip
-            return self._outcome(rewards)
+        envs, step = self._arrays, self._step
+        step.commands[:] = checked_actions(
+            actions, envs.ends, self._mode == vector_kernels.NEXT_STEP
+        )
+        alone = self._threads == 1
+        span = (0, self.num_envs) if alone else (len(self._scratch), self.num_envs)
+        scratch = self._scratch[0] if alone else self._scratch
         arguments = (
-            self._mode, self._records, commands, self._cases, self._drawn, self._constants,
-            self._tables, self._rows, self._keys, self._episodes, self._nothing_given,
-            self._observations, self._ends, rewards, self._final_records, self._final_observations,
+            *span, self._mode, envs, self._conditions, step, self._drawn, self._nothing_given,
+            scratch,
         )  # fmt: skip
-        if self._threads == 1:
-            vector_kernels.advance(0, n, *arguments, self._scratch[0])
+        if self._advance is None:
+            kernel = vector_kernels.advance if alone else vector_kernels.advance_in_threads
+            self._advance = entry_point(kernel, *arguments)
+        if alone:
+            self._advance(*arguments)
         else:
             with using_threads(self._threads):
-                chunks = len(self._scratch)
-                vector_kernels.advance_in_threads(chunks, n, *arguments, self._scratch)
-        return self._outcome(rewards)
-
-    def _outcome(self, rewards: Array) -> tuple[Array, Array, Array, Array]:
-        ended = self._ends != kernels.RUNNING
-        truncated = self._ends == kernels.TIME_LIMIT
-        # A copy: a reset of some environments hands out the others' observations again.
-        return self._observations.copy(), rewards, ended & ~truncated, truncated
+                self._advance(*arguments)
+        ended, truncated = envs.ends != kernels.RUNNING, envs.ends == kernels.TIME_LIMIT
+        # Copies: a later reset or step writes into the arrays.
+        return envs.observations.copy(), step.rewards.copy(), ended & ~truncated, truncated
 
     def _check_begun(self) -> None:
         if not self._begun:
-            if self._episodes.min() < 0:
+            if not self.begun:
                 raise gymnasium.error.ResetNeeded("the episodes have not begun: call reset() first")
             self._begun = True
 
     def _check_order(self) -> None:
         self._check_begun()
-        if self.autoreset_mode is AutoresetMode.DISABLED and self._ends.any():
+        if self.autoreset_mode is AutoresetMode.DISABLED and self._arrays.ends.any():
+            index = int(np.argmax(self._arrays.ends != kernels.RUNNING))
             raise gymnasium.error.ResetNeeded(
-                f"the episode of environment {int(np.argmax(self._ends != 0))} has ended: call "
+                f"the episode of environment {index} has ended: call "
                 "reset(options={'reset_mask': mask}) before step()"
             )
 
@@ -439,12 +428,14 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             return None
         self._check_begun()
         return tuple(
-            self._single.draw(
-                self.task_of(i), self._records[i], None if notes is None else notes[i]
-            )
+            self._single.draw(self.task_of(i), self.records[i], None if notes is None else notes[i])
             for i in range(self.num_envs)
         )
 
     def close_extras(self, **_: Any) -> None:
         """Free what drawing took."""
         self._single.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The compiled entry cannot be copied; the next step finds it again.
+        return {**self.__dict__, "_advance": None}

@@ -1,24 +1,79 @@
-"""Compiled kernels of the vector environment: the single environment's, on blocks of vehicles.
+"""Compiled kernels of the vector environment: control periods of many vehicles, and new episodes.
 
-A block's states are copied into scratch rows of `LANES` vehicles each, and every Runge-Kutta step
-is one loop over a row, which the compiler turns into vector instructions. All else is the single
-environment's own functions, vehicle by vehicle. Bits are those of the single environment.
+Under conditions each vehicle's period is the single environment's own function. Without them
+vehicles are integrated in blocks: the states of `LANES` vehicles are copied into rows of scratch,
+and every Runge-Kutta step is one loop over a row, which the compiler turns into vector
+instructions. Results are bit for bit those of the single environment.
 """
 
 import math
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import numba
+import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
+from lpv_track_env.conditions import layout
+from lpv_track_env.conditions.episode import begin_under_conditions, drive_under_conditions
 from lpv_track_env.draws import choice
 from lpv_track_env.episodes import TRAJECTORY_DRAW, VEHICLE_DRAW, begin
 from lpv_track_env.integration import in_half_steps, integrate, rotate, runge_kutta
 from trajectories.compilation import compiled, compiled_inline, compiled_internal, compiled_parallel
 
 Array = NDArray[Any]
+
+
+class EnvArrays(NamedTuple):
+    """Arrays of n environments that compiled code steps in place.
+
+    A case is a path driven by a vehicle; `kernels` lays out records and constants.
+    """
+
+    records: Array
+    """(n, RECORD_SIZE)."""
+    observations: Array
+    """(n, size) float32."""
+    ends: Array
+    """(n,) codes of `kernels.END_NAMES`."""
+    cases: Array
+    """(n,) row of each environment's case in `constants` and `rows`."""
+    constants: Array
+    """(cases, CONSTANTS_SIZE)."""
+    tables: Array
+    """(nodes, 8), the tables of all paths, one after another."""
+    rows: Array
+    """(cases, 2), first row of each case's table and the row after its last."""
+    draws: Array
+    """(n, 2) uint64, key of each environment's episodes and number of the current one."""
+
+
+class ConditionArrays(NamedTuple):
+    """Further arrays of n environments under conditions; `conditions.layout` lays them out."""
+
+    vehicles: Array
+    """(n, size)."""
+    specs: Array
+    """(cases, SPEC)."""
+
+
+class StepArrays(NamedTuple):
+    """Inputs and results of a step of n environments."""
+
+    commands: Array
+    """(n, 2), acceleration in m/s^2 and steering angle in rad."""
+    rewards: Array
+    """(n,)."""
+    final_records: Array
+    """(n, RECORD_SIZE), last records of the episodes that ended, in SAME_STEP."""
+    final_observations: Array
+    """(n, size) float32, likewise."""
+    final_reports: Array
+    """(n, 9) as `conditions.layout.REPORTED` lists them, likewise; unused without conditions."""
+
 
 LANES = 32
 """Vehicles in a block."""
@@ -95,21 +150,6 @@ def integrate_one(b: Array, j: int, record: Array, p: Array) -> None:
     b[3 * LANES + j], b[4 * LANES + j], b[5 * LANES + j] = r, x, y
 
 
-@compiled
-def first_bad(commands: Array, ends: Array, mode: int) -> int:
-    """Index into the flat `commands` (n, 2) of the first that is not finite, or -1.
-
-    In NEXT_STEP commands to environments that have ended are ignored.
-    """
-    for i in range(commands.shape[0]):
-        if mode == NEXT_STEP and ends[i] != k.RUNNING:
-            continue
-        for j in range(2):
-            if not math.isfinite(commands[i, j]):
-                return 2 * i + j
-    return -1
-
-
 @compiled_internal
 def draw_case(drawn: Any, key: Any, episode: Any) -> Any:
     """Draw the case of an episode, its path and its vehicle.
@@ -126,114 +166,157 @@ def draw_case(drawn: Any, key: Any, episode: Any) -> Any:
 
 
 @compiled_internal
-def begin_next(
-    i: int, record: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
-    rows: Array, observation: Array, keys: Array, episodes: Array, given: Array,
-) -> None:  # fmt: skip
-    """Begin the next episode of environment i, on a path and with a vehicle that are drawn."""
-    episodes[i] += 1
-    case = draw_case(drawn, keys[i], episodes[i])
-    cases[i] = case
-    table = tables[rows[case, 0] : rows[case, 1]]
-    begin(record, constants[case], table, observation, keys[i], episodes[i], given)
+def begin_next(i: int, envs: EnvArrays, conditions: Any, drawn: Any, given: Array) -> None:
+    """Begin the next episode of environment i, with a path and a vehicle that are drawn."""
+    draws = envs.draws[i]
+    draws[1] += np.uint64(1)
+    case = draw_case(drawn, draws[0], draws[1])
+    envs.cases[i] = case
+    record, observation, constants = envs.records[i], envs.observations[i], envs.constants[case]
+    table = envs.tables[envs.rows[case, 0] : envs.rows[case, 1]]
+    if conditions is None:
+        begin(record, constants, table, observation, draws[0], draws[1], given)
+    else:
+        begin_under_conditions(
+            conditions.vehicles[i], record, conditions.specs[case], constants, table, observation,
+            draws, given,
+        )  # fmt: skip
 
 
 @compiled_internal
 def copy(source: Array, target: Array) -> None:
-    """Copy a vector; an assignment would want record for the case that the two overlap."""
+    """Copy a vector; an assignment would need memory in case the two overlap."""
     for j in range(source.shape[0]):
         target[j] = source[j]
 
 
+@compiled_internal
+def copy_report(vehicle: Array, report: Array) -> None:
+    """Copy what infos show of a vehicle under conditions, in the order of `layout.REPORTED`."""
+    for j in range(6):
+        report[j] = vehicle[layout.ESTIMATE + j]
+    report[6] = vehicle[layout.DEVIATION]
+    report[7], report[8] = vehicle[layout.STOPPING], vehicle[layout.MISSES]
+
+
+@compiled_internal
+def integrate_block(envs: EnvArrays, commands: Array, low: int, lanes: int, b: Array) -> None:
+    """Integrate the `lanes` environments from `low` on over a control period, in scratch `b`."""
+    uniform = True
+    for j in range(LANES):
+        # Lanes beyond the last environment repeat the first, so that every lane is a vehicle.
+        i = low + j if j < lanes else low
+        load_lane(b, j, envs.records[i], commands[i], envs.constants[envs.cases[i]])
+        uniform = uniform and b[SUBSTEPS + j] == b[SUBSTEPS]
+    if uniform:
+        integrate_lanes(b, int(b[SUBSTEPS]))
+    else:
+        for j in range(lanes):
+            integrate_one(b, j, envs.records[low + j], envs.constants[envs.cases[low + j]])
+
+
 @compiled
 def advance(
-    first: int, last: int, mode: int,
-    records: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
-    rows: Array, keys: Array, episodes: Array, given: Array,
-    observations: Array, ends: Array, rewards: Array, final_records: Array,
-    final_observations: Array, b: Array,
+    first: int, last: int, mode: int, envs: EnvArrays, conditions: Any, step: StepArrays,
+    drawn: Any, given: Array, b: Array,
 ) -> None:  # fmt: skip
     """One control period of the environments `first` to `last` - 1, with autoreset.
 
-    `ends` (n,) holds each environment's end code of the last step and is given the new one. In
-    NEXT_STEP an environment that had ended begins anew instead, with reward 0; in SAME_STEP one
-    that ends begins anew at once, its last record and observation kept in the `final_` arrays. `b`
-    is scratch, (SCRATCH_SIZE,).
+    In NEXT_STEP an environment that has ended begins anew instead, with reward 0. In SAME_STEP one
+    that ends begins anew at once, and the `final_` arrays of `step` keep its end.
+
+    Parameters
+    ----------
+    conditions
+        `ConditionArrays`, or None: numba compiles one version for each.
+    drawn, given
+        As `draw_case` and `kernels.begin` take them, for the episodes that begin.
+    b
+        Scratch: (SCRATCH_SIZE,), or (`filter.WORK`,) under conditions.
     """
     for low in range(first, last, LANES):
         lanes = min(LANES, last - low)
-        uniform = True
-        for j in range(LANES):
-            # Lanes beyond the last environment repeat the first: no lane holds rubbish.
-            i = low + j if j < lanes else low
-            load_lane(b, j, records[i], actions[i], constants[cases[i]])
-            uniform = uniform and b[SUBSTEPS + j] == b[SUBSTEPS]
-        if uniform:
-            integrate_lanes(b, int(b[SUBSTEPS]))
-        else:
-            for j in range(lanes):
-                integrate_one(b, j, records[low + j], constants[cases[low + j]])
+        if conditions is None:
+            integrate_block(envs, step.commands, low, lanes, b)
         for j in range(lanes):
             i = low + j
-            record, observation = records[i], observations[i]
-            begins = mode == NEXT_STEP and ends[i] != k.RUNNING
+            record, observation = envs.records[i], envs.observations[i]
+            begins = mode == NEXT_STEP and envs.ends[i] != k.RUNNING
             if begins:
-                ends[i], rewards[i] = k.RUNNING, 0.0
+                envs.ends[i], step.rewards[i] = k.RUNNING, 0.0
             else:
-                case = cases[i]
-                ends[i] = k.finish(
-                    record, constants[case], tables[rows[case, 0] : rows[case, 1]], observation,
-                    b[VX * LANES + j], b[VY * LANES + j], b[PSI * LANES + j],
-                    b[YAW_RATE * LANES + j], b[X * LANES + j], b[Y * LANES + j],
-                    b[ACCELERATION + j], b[STEERING + j], int(b[CLIPPED + j]),
-                )  # fmt: skip
-                rewards[i] = record[k.REWARD]
-                if mode == SAME_STEP and ends[i] != k.RUNNING:
+                case = envs.cases[i]
+                constants = envs.constants[case]
+                table = envs.tables[envs.rows[case, 0] : envs.rows[case, 1]]
+                if conditions is None:
+                    envs.ends[i] = k.finish(
+                        record, constants, table, observation,
+                        b[VX * LANES + j], b[VY * LANES + j], b[PSI * LANES + j],
+                        b[YAW_RATE * LANES + j], b[X * LANES + j], b[Y * LANES + j],
+                        b[ACCELERATION + j], b[STEERING + j], int(b[CLIPPED + j]),
+                    )  # fmt: skip
+                else:
+                    envs.ends[i] = drive_under_conditions(
+                        conditions.vehicles[i], record, step.commands[i, 0], step.commands[i, 1],
+                        conditions.specs[case], constants, table, observation,
+                        envs.draws[i, 0], envs.draws[i, 1], b,
+                    )  # fmt: skip
+                step.rewards[i] = record[k.REWARD]
+                if mode == SAME_STEP and envs.ends[i] != k.RUNNING:
                     begins = True
-                    copy(record, final_records[i])
-                    copy(observation, final_observations[i])
+                    copy(record, step.final_records[i])
+                    copy(observation, step.final_observations[i])
+                    if conditions is not None:
+                        copy_report(conditions.vehicles[i], step.final_reports[i])
             # One call for both modes: every call is compiled in.
             if begins:
-                begin_next(
-                    i, record, cases, drawn, constants, tables, rows, observation,
-                    keys, episodes, given,
-                )  # fmt: skip
+                begin_next(i, envs, conditions, drawn, given)
 
 
 @compiled_parallel
 def advance_in_threads(
-    chunks: int, n: int, mode: int,
-    records: Array, actions: Array, cases: Array, drawn: Any, constants: Array, tables: Array,
-    rows: Array, keys: Array, episodes: Array, given: Array,
-    observations: Array, ends: Array, rewards: Array, final_records: Array,
-    final_observations: Array, scratch: Array,
+    chunks: int, n: int, mode: int, envs: EnvArrays, conditions: Any, step: StepArrays,
+    drawn: Any, given: Array, scratch: Array,
 ) -> None:  # fmt: skip
     """`advance` on all n environments, in chunks of whole blocks that threads share.
 
     Each chunk has its own row of `scratch`.
     """
-    blocks = (n + LANES - 1) // LANES
+    size = LANES
+    if conditions is not None:
+        size = 1
+    blocks = (n + size - 1) // size
     for chunk in numba.prange(chunks):
-        first = chunk * blocks // chunks * LANES
-        last = min((chunk + 1) * blocks // chunks * LANES, n)
-        advance(
-            first, last, mode, records, actions, cases, drawn, constants, tables, rows,
-            keys, episodes, given, observations, ends, rewards, final_records,
-            final_observations, scratch[chunk],
-        )  # fmt: skip
+        first = chunk * blocks // chunks * size
+        last = min((chunk + 1) * blocks // chunks * size, n)
+        advance(first, last, mode, envs, conditions, step, drawn, given, scratch[chunk])
 
 
 @compiled
-def begin_all(
-    mask: Array,
-    records: Array, cases: Array, drawn: Any, constants: Array, tables: Array, rows: Array,
-    keys: Array, episodes: Array, given: Array, observations: Array, ends: Array,
-) -> None:  # fmt: skip
+def begin_all(mask: Array, envs: EnvArrays, conditions: Any, drawn: Any, given: Array) -> None:
     """Begin the next episode of every environment that `mask` (n,) marks."""
     for i in range(mask.shape[0]):
         if mask[i]:
-            ends[i] = k.RUNNING
-            begin_next(
-                i, records[i], cases, drawn, constants, tables, rows, observations[i],
-                keys, episodes, given,
-            )  # fmt: skip
+            envs.ends[i] = k.RUNNING
+            begin_next(i, envs, conditions, drawn, given)
+
+
+SHARES = 8
+"""Shares of the work for each thread: some shares take longer, or a processor may be taken."""
+
+
+def shares(threads: int) -> int:
+    """Return the number of shares into which threads divide their work."""
+    return SHARES * threads if threads > 1 else 1
+
+
+@contextmanager
+def using_threads(threads: int) -> Iterator[None]:
+    """Run numba's parallel loops in this many threads, each taking the next free share."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(threads)
+    try:
+        with numba.parallel_chunksize(1):
+            yield
+    finally:
+        numba.set_num_threads(before)

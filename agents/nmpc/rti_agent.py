@@ -18,7 +18,8 @@ from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
 from agents.nmpc.schedule import NO_BAND, WEIGHTS
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import TrackingObservation
-from lpv_track_env.threads import checked_threads, shares, using_threads
+from lpv_track_env.validation import checked_threads
+from lpv_track_env.vector_kernels import shares, using_threads
 from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]

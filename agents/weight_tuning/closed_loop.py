@@ -25,8 +25,9 @@ from agents.weight_tuning.deciding import NOBODY, Decider
 from agents.weight_tuning.loop_memory import LoopMemory
 from lpv_track_env import kernels as k
 from lpv_track_env.estimation import filter as filtering
-from lpv_track_env.threads import checked_threads, shares, using_threads
+from lpv_track_env.validation import checked_threads
 from lpv_track_env.vector_env import PathTrackingVectorEnv
+from lpv_track_env.vector_kernels import shares, using_threads
 from trajectories import CurvatureBands
 
 Array = NDArray[Any]
@@ -217,7 +218,7 @@ class ClosedLoop:
         tally = np.zeros((n, loops.TALLY))
         memory, nmpc, arrays = self.memory, self.memory.nmpc, self.envs.arrays
         arguments = (
-            periods, *arrays, memory.looked, memory.commands, memory.feet, self._future, sets,
+            periods, *arrays[:-1], memory.looked, memory.commands, memory.feet, self._future, sets,
             rules, nmpc.bands, nmpc.weights, memory.watched, until_band, since,
             *(NOBODY if self._decider is None or weights is not None else self._decider.arguments),
             self.agent.solver.constants, nmpc.plans, nmpc.flags, nmpc.told, nmpc.states,
@@ -248,7 +249,7 @@ class ClosedLoop:
         n, given = self.envs.num_envs, self.envs.condition_arrays
         work = (*self._work, *(() if given is None else (self._filter_work,)))
         kernel: Any = loops.drive_rows if given is None else loops.drive_rows_under_conditions
-        more = given or ()
+        more = () if given is None else (*given, self.envs.arrays.draws)
         spaces = len(self._work)
         if self._threads == 1:
             own = [space[0] for space in work]

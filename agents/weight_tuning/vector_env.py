@@ -23,7 +23,7 @@ from agents.weight_tuning.score import FAILED, failed, marginal_parts, parts_of,
 from agents.weights import in_words
 from lpv_track_env import kernels as k
 from lpv_track_env.conditions import Conditions
-from lpv_track_env.vector_checks import checked_mask, checked_mode
+from lpv_track_env.validation import checked_mask, checked_mode
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from lpv_track_env.vector_infos import NAMES
 from lpv_track_env.vehicle import VehicleParameters

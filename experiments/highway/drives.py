@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 import agents
 from agents.registry import check_settings, source_file
 from experiments.run.case import project_digest
+from lpv_track_env import HIGHWAY_TRACK
 from lpv_track_env.bicycle import VX
-from lpv_track_env.registration import HIGHWAY_TRACK
 
 Array = NDArray[np.float64]
 

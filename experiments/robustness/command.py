@@ -18,7 +18,7 @@ from experiments.run.benchmark import progress_bar
 from experiments.run.case import project_digest
 from experiments.run.provenance import hardware, revision, versions
 from lpv_track_env import conditions
-from lpv_track_env.threads import checked_threads
+from lpv_track_env.validation import checked_threads
 from trajectories.fileio import write_atomically
 
 MOST_SPAN = 1e4

@@ -16,8 +16,8 @@ from experiments.run.case import Case
 from experiments.run.rollout import steps
 from experiments.speed.measure import Effort, Run, Section, Tick, calibrated, interleave, module
 from experiments.speed.numpy_env import NumpyTracking
+from lpv_track_env import PATH_TRACKING
 from lpv_track_env.env import PathTrackingEnv
-from lpv_track_env.registration import PATH_TRACKING
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 
 OURS = "lpv-track-env"

@@ -23,7 +23,7 @@ from experiments.speed.measure import (
     interleave,
     module,
 )
-from lpv_track_env.registration import PATH_TRACKING
+from lpv_track_env import PATH_TRACKING
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 
 PERIODS = 20

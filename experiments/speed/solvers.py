@@ -27,8 +27,8 @@ from experiments.speed.measure import (
     calibrated,
     interleave,
 )
+from lpv_track_env import PATH_TRACKING
 from lpv_track_env.observation import SCALARS
-from lpv_track_env.registration import PATH_TRACKING
 
 NMPC = "lpv-nmpc"
 DRIVER = "lpv-nmpc-ipopt"

@@ -25,7 +25,7 @@ from experiments.verify.oracles import (
     PlanCost,
     plan_cost,
 )
-from lpv_track_env.registration import PATH_TRACKING
+from lpv_track_env import PATH_TRACKING
 from trajectories import load
 
 Array = NDArray[np.float64]

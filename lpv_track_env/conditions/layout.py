@@ -15,7 +15,7 @@ from lpv_track_env import kernels
 from lpv_track_env.conditions import DRAWN, ESTIMATORS, LONGEST_DELAY, Conditions
 from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.task import Task
-from lpv_track_env.vehicle import PARAMETER_ORDER, VehicleParameters
+from lpv_track_env.vehicle import PARAMETER_ORDER
 from trajectories.compilation import compiled_internal
 
 Array = NDArray[np.float64]
@@ -102,8 +102,10 @@ def vehicle_size(conditions: Conditions, period: float) -> int:
     return TAIL + COMMAND * commands + WAY * fixes + filtering.FILTER + filtering.NODE * nodes
 
 
-def spec_of(conditions: Conditions, vehicle: VehicleParameters, period: float) -> Array:
-    """Numbers as the kernels take them, shape (SPEC,), for a vehicle and a control period (s)."""
+def spec_of(task: Task) -> Array:
+    """Numbers as the kernels take them, shape (SPEC,), for a task under conditions."""
+    conditions, period = task.conditions, task.control_period
+    assert conditions is not None
     age = conditions.max_command_age
     commands, fixes, _ = rooms(conditions, period)
     return np.concatenate(
@@ -119,7 +121,7 @@ def spec_of(conditions: Conditions, vehicle: VehicleParameters, period: float) -
                 fixes,
             ],
             conditions.filter_settings.initial_variances,
-            conditions.filter_settings.as_array(vehicle),
+            conditions.filter_settings.as_array(task.vehicle),
         ]
     )
 
@@ -139,7 +141,7 @@ class ConditionsArrays(NamedTuple):
             return None
         return cls(
             np.zeros(vehicle_size(task.conditions, task.control_period)),
-            spec_of(task.conditions, task.vehicle, task.control_period),
+            spec_of(task),
             np.zeros(filtering.WORK),
         )
 
@@ -179,7 +181,7 @@ def single_report(report: Array) -> dict[str, Any]:
     }
 
 
-def reports_infos(reports: Array, mask: Array) -> dict[str, Any]:
+def reports_infos(reports: Array, mask: NDArray[np.bool_]) -> dict[str, Any]:
     """The same of many vehicles, from reports (n, 9), for those that `mask` (n,) marks."""
     shown = np.where(mask[:, None], reports, 0.0)
     infos: dict[str, Any] = {

@@ -11,7 +11,6 @@ from highway_env.road.road import RoadNetwork
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels, plants
-from lpv_track_env.actions import check_action
 from lpv_track_env.bicycle import VX
 from lpv_track_env.conditions import Conditions
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
@@ -22,6 +21,7 @@ from lpv_track_env.highway.reference import TrafficReference
 from lpv_track_env.highway.traffic import others_on
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task
+from lpv_track_env.validation import check_action
 from lpv_track_env.vehicle import VehicleParameters
 from lpv_track_env.vehicle import load as load_vehicle
 from trajectories.naming import choose

@@ -19,7 +19,7 @@ import trajectories
 from agents.base import TrackingAgent
 from agents.registry import check_settings
 from experiments.run.case import Case, run_case
-from lpv_track_env.registration import PATH_TRACKING
+from lpv_track_env import PATH_TRACKING
 from tests.helpers.learned_policies import DRIVING, driving_file
 
 each_agent = pytest.mark.parametrize("name", [*agents.names(), *DRIVING])

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import agents
-from lpv_track_env.registration import PATH_TRACKING
+from lpv_track_env import PATH_TRACKING
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 
 Array = NDArray[Any]

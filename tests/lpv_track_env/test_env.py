@@ -20,9 +20,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import trajectories
-from lpv_track_env import kernels
+from lpv_track_env import PATH_TRACKING, kernels
 from lpv_track_env.env import PathTrackingEnv
-from lpv_track_env.registration import PATH_TRACKING
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES
 from trajectories import shapes

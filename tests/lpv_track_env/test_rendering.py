@@ -13,9 +13,8 @@ import pygame
 import pytest
 from numpy.typing import NDArray
 
-from lpv_track_env import kernels
+from lpv_track_env import PATH_TRACKING, kernels
 from lpv_track_env.env import PathTrackingEnv
-from lpv_track_env.registration import PATH_TRACKING
 from lpv_track_env.rendering import COLOURINGS, HEIGHT, WIDTH, Renderer, Scenery, style
 from lpv_track_env.rendering.camera import MIDDLE, ROOM, Camera
 from lpv_track_env.rendering.charts import signals_of

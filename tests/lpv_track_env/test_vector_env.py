@@ -16,9 +16,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
 import trajectories
+from lpv_track_env import PATH_TRACKING
 from lpv_track_env.conditions import REALTIME
 from lpv_track_env.env import PathTrackingEnv
-from lpv_track_env.registration import PATH_TRACKING
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES
 from tests.helpers.vector_equality import assert_equal, step_both
@@ -128,7 +128,7 @@ def test_states_that_are_no_longer_finite(mode: AutoresetMode) -> None:
     ours.reset(seed=0)
     theirs.reset(seed=0)
     # No action brings this about: the field's r vy must overflow.
-    ours._records[2, [1, 3]] = 1e200
+    ours.records[2, [1, 3]] = 1e200
     theirs.envs[2].unwrapped._record[[1, 3]] = 1e200
     *_, infos = step_both(ours, theirs, actions(5, 1)[0], mode)
     assert infos.get("final_info", infos)["end"][2] == "non_finite"
@@ -318,7 +318,7 @@ def test_one_table_for_all_vehicles() -> None:
     cars = [M2_MINIBUS.replace(mass=3000.0 + k) for k in range(50)]
     env = make(2, trajectory=["T1", "T2"], vehicle=cars)
     lengths = [len(trajectories.load(name).x) for name in ("T1", "T2")]
-    assert len(env._tables) == sum(lengths)
+    assert len(env.arrays.tables) == sum(lengths)
 
 
 def test_action_space_is_the_widest() -> None:

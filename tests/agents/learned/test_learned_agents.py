@@ -18,8 +18,8 @@ from agents.learned.agent import Bc, LearnedPolicy, Ppo, Sac
 from agents.learned.network import Network
 from experiments.cli import main
 from experiments.run.case import Case, run_case
+from lpv_track_env import PATH_TRACKING
 from lpv_track_env.observation import ObservationLayout
-from lpv_track_env.registration import PATH_TRACKING
 from tests.helpers.learned_policies import (
     act,
     driving_file,

@@ -14,8 +14,8 @@ from agents.base import DrivingTask
 from agents.learned.agent import LearnedPolicy
 from agents.learned.learner import LIMIT, LearnerVecEnv, Scaling, usual_scaling
 from agents.learned.policy import ORIGINS, Policy
+from lpv_track_env import PATH_TRACKING
 from lpv_track_env.observation import ObservationLayout
-from lpv_track_env.registration import PATH_TRACKING
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 
 SETTINGS: dict[str, Any] = {

@@ -13,8 +13,8 @@ import pytest
 import agents
 from agents.learned import read
 from experiments.cli import main
+from lpv_track_env import PATH_TRACKING
 from lpv_track_env.observation import ObservationLayout
-from lpv_track_env.registration import PATH_TRACKING
 from lpv_track_env.vehicle import VEHICLES
 from tests.helpers.learned_policies import act, observations
 

@@ -20,11 +20,11 @@ from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Obstacle
 
 import agents
+from lpv_track_env import HIGHWAY_TRACK
 from lpv_track_env.bicycle import derivative
 from lpv_track_env.highway.cruise import CruiseControl
 from lpv_track_env.highway.env import HighwayTrackEnv
 from lpv_track_env.highway.scenes import SCENES
-from lpv_track_env.registration import HIGHWAY_TRACK
 
 FORMS = {
     "dictionary": {},

@@ -1,0 +1,189 @@
+"""Checks of what environments are given: actions, reset options, seeds, modes, threads.
+
+A check returns the value in the form that its caller works with, or raises an error of one line.
+"""
+
+import math
+import operator
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numba
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from lpv_track_env.episodes import GIVEN
+from lpv_track_env.kernels import first_not_finite
+from trajectories.naming import choose
+
+Array = NDArray[Any]
+
+ENTRIES = ("0 (acceleration)", "1 (steering angle)")
+NUMBERS = (float, int)
+
+
+def two_numbers(action: Any) -> tuple[float, float]:
+    """Return the two real numbers that an action consists of.
+
+    Raises
+    ------
+    ValueError
+        For anything but two real numbers.
+    """
+    try:
+        # Through plain Python values: they tell a number from text, bool or complex.
+        values = np.asarray(action).tolist()
+        a, delta = values
+        if not (type(values) is list and type(a) in NUMBERS and type(delta) in NUMBERS):
+            raise TypeError
+        return float(a), float(delta)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(
+            f"action must be two numbers [acceleration m/s^2, steering angle rad], not {action!r}"
+        ) from None
+
+
+def check_finite(a: float, delta: float, action: Any) -> None:
+    """Raise a ValueError that names the first entry of an action that is not finite, if any."""
+    for value, entry in zip((a, delta), ENTRIES, strict=True):
+        if not math.isfinite(value):
+            raise ValueError(f"action entry {entry} is not finite: {action!r}")
+
+
+def check_action(action: Any) -> None:
+    """Raise the ValueError with which `step` refuses an action, if it does."""
+    a, delta = two_numbers(action)
+    check_finite(a, delta, action)
+
+
+def checked_actions(actions: Any, ends: Array, skips_ended: bool) -> Array:
+    """Return actions as an array (n, 2) of numbers, after a check of those that are not ignored.
+
+    `ends` (n,) are the environments' end codes; `skips_ended` ignores the actions of environments
+    whose episode has ended.
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape or type, or naming environment and entry that is not finite.
+    """
+    shape = (len(ends), 2)
+    try:
+        given = np.asarray(actions)
+    except ValueError:
+        given = np.empty(0)
+    if given.shape != shape or given.dtype.kind not in "fiu":
+        raise ValueError(
+            f"actions must be an array {shape} of numbers [acceleration m/s^2, steering angle "
+            f"rad], not {given.shape} of {given.dtype}"
+        )
+    commands = np.ascontiguousarray(given, dtype=np.float64)
+    bad = first_not_finite(commands, ends, skips_ended)
+    if bad >= 0:
+        index, entry = divmod(bad, 2)
+        raise ValueError(
+            f"action of environment {index}, entry {ENTRIES[entry]}, is not finite: "
+            f"{given[index]!r}"
+        )
+    return commands
+
+
+def checked_mask(mask: Any, num_envs: int) -> Array:
+    """Return a copy of a mask of environments (n,); None marks all.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For another type, a wrong shape, or a mask that marks none.
+    """
+    if mask is None:
+        return np.ones(num_envs, dtype=np.bool_)
+    if not (isinstance(mask, np.ndarray) and mask.dtype == np.bool_):
+        raise TypeError("options['reset_mask'] must be a NumPy array of dtype bool")
+    if mask.shape != (num_envs,):
+        raise ValueError(f"options['reset_mask'] must have shape ({num_envs},), not {mask.shape}")
+    if not mask.any():
+        raise ValueError("options['reset_mask'] must mark at least one environment")
+    return mask.copy()
+
+
+def checked_seeds(seed: Any, num_envs: int) -> Sequence[int | None]:
+    """Return a seed for each environment, None for those without one.
+
+    Raises
+    ------
+    ValueError
+        For a list of another length.
+    """
+    if seed is None:
+        return [None] * num_envs
+    if not isinstance(seed, Sequence):
+        return [operator.index(seed) + i for i in range(num_envs)]
+    if len(seed) != num_envs:
+        raise ValueError(f"{len(seed)} seeds for num_envs={num_envs}: give one for each")
+    return list(seed)
+
+
+def listed(kind: str, value: Any) -> list[Any]:
+    """Return the items of a list or tuple, or a list of the one item."""
+    if not isinstance(value, list | tuple):
+        return [value]
+    if not value:
+        raise ValueError(f"{kind}: an empty sequence")
+    return list(value)
+
+
+def checked_mode(value: AutoresetMode | str) -> AutoresetMode:
+    """Return an autoreset mode, given as such or by its value."""
+    if isinstance(value, AutoresetMode):
+        return value
+    known = tuple(mode.value for mode in AutoresetMode)
+    return AutoresetMode(choose("autoreset_mode", value, known))
+
+
+def checked_threads(value: int) -> int:
+    """Return a number of threads that numba can use.
+
+    Raises
+    ------
+    ValueError
+        For fewer than one, or more than numba sees processors.
+    """
+    threads = operator.index(value)
+    most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    if not 1 <= threads <= most:
+        raise ValueError(
+            f"threads must be from 1 to {most} (the processors numba sees; NUMBA_NUM_THREADS sets "
+            f"it), not {value}"
+        )
+    if threads > 1:
+        # Waiting threads would spin otherwise: on a busy machine a step then takes 700 times as
+        # long.
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    return threads
+
+
+def given_start(options: Mapping[str, Any], length: float) -> NDArray[np.float64]:
+    """Return the start that reset options give, (4,) in the order of `GIVEN`; NaN is drawn.
+
+    Raises
+    ------
+    ValueError
+        For a value that is not a finite number, or an arc length outside of the path.
+    """
+    start = np.full(len(GIVEN), math.nan)
+    for k, key in enumerate(GIVEN):
+        if key not in options:
+            continue
+        try:
+            value = float(options[key])
+        except (TypeError, ValueError):
+            value = math.nan
+        if not math.isfinite(value):
+            raise ValueError(f"reset option {key} must be a finite number, not {options[key]!r}")
+        if key == "arc_length" and not 0.0 <= value <= length:
+            raise ValueError(f"option arc_length must be in [0, {length:.2f}] m, not {value}")
+        start[k] = value
+    return start
