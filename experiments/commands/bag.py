@@ -286,9 +286,8 @@ def _replay(options: argparse.Namespace, console: Console) -> int:
     import trajectories
     from experiments.ros.comparison import draw, summary, table
     from experiments.ros.replay import record, replay
-    from lpv_track_env import vehicle
+    from lpv_track_env import PATH_TRACKING, vehicle
     from lpv_track_env.estimation.observer import PathObserver
-    from lpv_track_env.registration import PATH_TRACKING
     from trajectories.fileio import write_atomically
 
     path = trajectories.load(options.trajectory)
