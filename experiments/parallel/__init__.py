@@ -1,1 +1,1 @@
-"""Estimator and controller as processes of their own, beside a vehicle simulated in real time."""
+"""Estimator and controller as separate processes, driving a vehicle simulated in real time."""

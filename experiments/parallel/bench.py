@@ -1,4 +1,4 @@
-"""How long a value takes from one process to another, by ways of waiting for it."""
+"""Latency of a value from one process to another, for several ways of waiting for it."""
 
 import multiprocessing
 import time
@@ -17,25 +17,25 @@ from experiments.parallel.processes import READY, Child, Link, quiet
 from experiments.parallel.setup import ESTIMATE
 
 VALUES = 1000
-"""Written for each way of waiting, not counting the first."""
+"""Values written for each way of waiting, without the warm-up."""
 WARM_UP = 20
 PAUSE = 0.005
-"""s between values: the reader has gone to sleep by then."""
+"""Time between values, s: long enough for the reader to fall asleep."""
 NAP = 1e-4
-"""s that the polling reader sleeps between looks."""
+"""Sleep of the polling reader between checks, s."""
 TIMEOUT = 1.0
 
 Wait = Callable[[Reader, Any], Message | None]
 
 
 def by_pipe(reader: Reader, condition: Any) -> Message | None:
-    """The mailbox's own way."""
+    """Wait for the mailbox's pipe, as the run does."""
     del condition
     return reader.wait(TIMEOUT)
 
 
 def by_polling(reader: Reader, condition: Any) -> Message | None:
-    """Look, sleep a little, look again."""
+    """Check, sleep a little, check again."""
     del condition
     while (message := reader.wait(0.0)) is None:
         time.sleep(NAP)
@@ -43,7 +43,7 @@ def by_polling(reader: Reader, condition: Any) -> Message | None:
 
 
 def by_spinning(reader: Reader, condition: Any) -> Message | None:
-    """Look all the time: the least that can be had, at the price of a core."""
+    """Check all the time: the smallest possible latency, at the price of a core."""
     del condition
     while (message := reader.wait(0.0)) is None:
         pass
@@ -51,7 +51,7 @@ def by_spinning(reader: Reader, condition: Any) -> Message | None:
 
 
 def by_condition(reader: Reader, condition: Any) -> Message | None:
-    """`multiprocessing.Condition`, whose lock a killed process may keep for good."""
+    """Wait for a `multiprocessing.Condition`, whose lock a killed process may hold forever."""
     with condition:
         while (message := reader.wait(0.0)) is None:
             condition.wait(TIMEOUT)
@@ -69,13 +69,13 @@ WAYS: dict[str, Wait] = {
 def read(
     link: Link, reader: Reader, condition: Any, way: str, values: int, said: Connection
 ) -> None:
-    """Take the values and send back how long each was on its way, s."""
+    """Take the values and send back their latencies, s."""
     wait = WAYS[way]
     latencies: list[float] = []
     reader.open()
     link.say(READY)
     quiet()
-    while reader.taken < values + WARM_UP:  # One that was not taken in time is skipped.
+    while reader.taken < values + WARM_UP:  # A value that was overwritten is skipped.
         message = wait(reader, condition)
         now = time.monotonic_ns()
         if message is None:
@@ -87,9 +87,9 @@ def read(
 
 
 def measure(way: str, values: int) -> NDArray[np.float64]:
-    """Latencies of one way, s, from the writer's stamp to the reader having the value.
+    """Return latencies of one way, s, from the writer's stamp to the reader holding the value.
 
-    A value that was not taken before the next is not among them.
+    Values that were overwritten before they were read are left out.
     """
     context = multiprocessing.get_context("spawn")
     mailbox = Mailbox(ESTIMATE)
@@ -121,7 +121,7 @@ def measure(way: str, values: int) -> NDArray[np.float64]:
 
 
 def costs() -> dict[str, float]:
-    """Median time of a write and of a look within one process, s."""
+    """Return the median times of a write and of a read within one process, s."""
     mailbox = Mailbox(ESTIMATE)
     writer, reader = mailbox.writer.open(), mailbox.reader.open()
     record = np.zeros((), ESTIMATE)
@@ -138,7 +138,7 @@ def costs() -> dict[str, float]:
 
 
 def bench_mailbox(console: Console) -> dict[str, Any]:
-    """Measure all ways in turn, print a table; returns the figures, s."""
+    """Measure all ways in turn, print a table, return the figures, s."""
     rows = Table(box=box.SIMPLE_HEAD, title=f"wake latency, us, {VALUES} values {PAUSE:g} s apart")
     for heading in ("", "median", "99 %", "max"):
         rows.add_column(heading, justify="left" if not heading else "right")
@@ -154,6 +154,6 @@ def bench_mailbox(console: Console) -> dict[str, Any]:
         rows.add_row(way, *(f"{1e6 * value:.1f}" for value in figures.values()))
     console.print(rows)
     found["cost"] = costs()
-    told = ", ".join(f"{name} {1e6 * value:.1f} us" for name, value in found["cost"].items())
-    console.print(f"median cost in one process: {told}", highlight=False)
+    words = ", ".join(f"{name} {1e6 * value:.1f} us" for name, value in found["cost"].items())
+    console.print(f"median cost in one process: {words}", highlight=False)
     return found

@@ -1,4 +1,4 @@
-"""The controller's process: an estimate in, a command out; it brakes on what it cannot trust."""
+"""The controller's process: estimates in, commands out; it brakes on stale or invalid estimates."""
 
 import math
 import time
@@ -28,18 +28,18 @@ from lpv_track_env.vehicle import VehicleParameters
 WARM_UP = 20
 """Calls of `predict` before the clock starts."""
 FAR = 1.0
-"""m between two estimates, beyond which some were missed: less than the observer looks around."""
+"""Distance between two estimates beyond which the place on the path is searched anew, m."""
 MAX_FAILURES = 10
-"""Failed calls of `predict` in a row after which the process gives up."""
+"""Consecutive failed calls of `predict` after which the process ends."""
 
 
 def control(link: Link, setup: Setup, estimates: Reader, commands: Writer) -> None:
-    """Answer every estimate with a command until the supervisor stops it.
+    """Answer every estimate with a command until the supervisor stops the process.
 
     Raises
     ------
     RuntimeError
-        When the agent has failed ten times in a row; until then each failure is a command to brake.
+        When the agent has failed ten times in a row; each failure before that brakes.
     """
     with estimates, commands:
         link.say(ATTACHED)
@@ -57,7 +57,7 @@ def control(link: Link, setup: Setup, estimates: Reader, commands: Writer) -> No
 
 
 def prepared(setup: Setup) -> "Controller":
-    """A controller whose agent has been asked some times, so that nothing is left to compile."""
+    """Return a controller whose agent has been called, so that everything is compiled."""
     env = setup.task_env()
     agent = setup.make_agent(env)
     observer = PathObserver(env.path, env.layout)
@@ -71,18 +71,18 @@ def prepared(setup: Setup) -> "Controller":
 
 
 class Controller:
-    """What is commanded, estimate by estimate.
+    """Commands of an agent, estimate by estimate.
 
     Parameters
     ----------
     agent
         Anything with `predict`.
     observer
-        Makes its observations of estimates.
+        Computes the agent's observations from estimates.
     vehicle
-        That is stopped where there is nothing to drive on.
+        Vehicle, for the deceleration that stops it.
     setup
-        The run's.
+        Settings of the run.
     """
 
     def __init__(
@@ -97,20 +97,20 @@ class Controller:
         self._speed = 0.0
         self._place = (math.inf, math.inf)
         self.command: NDArray[Any] = np.zeros((), COMMAND)
-        """The last command; `taken` is 0 before there was one."""
+        """Last command; its `taken` is 0 before the first."""
 
     def is_stale(self, now: int) -> bool:
-        """Whether the newest estimate is three control periods old at `now` (ns)."""
+        """Return whether the newest estimate is three control periods old at time `now` (ns)."""
         taken = int(self.command["taken"])
         return taken > 0 and now - taken >= self._stale_after
 
     def patience(self, now: int) -> float:
-        """How long to wait for an estimate, s: until the newest is stale, then a period."""
+        """Return the time to wait for an estimate, s: until the newest is stale, then a period."""
         left = 1e-9 * (int(self.command["taken"]) + self._stale_after - now)
         return min(left, self._period) if left > 0.0 else self._period
 
     def answer(self, estimate: Any, estimated: int) -> None:
-        """Set the command that answers an ESTIMATE record, which was written at `estimated`."""
+        """Set the command for an ESTIMATE record that was written at time `estimated` (ns)."""
         command = self.command
         command["period"], command["taken"] = estimate["period"], estimate["taken"]
         command["estimated"] = estimated
@@ -118,12 +118,12 @@ class Controller:
         state, steering_angle = estimate["state"], float(estimate["steering_angle"])
         self._speed = float(state[VX])
         if not np.isfinite(state).all():
-            # Never to the observer, which goes on from where the vehicle was last.
+            # The observer would lose the place on the path.
             self._speed = math.nan
             self._brake(NOT_FINITE, steering_angle)
             return
         offset = float(estimate["steering_offset"])
-        # Also where nothing is driven, so as not to lose the place on the path.
+        # Also if the command will be to brake, so as not to lose the place on the path.
         self._follow(float(state[X]), float(state[Y]))
         observation = self._observer.observe(
             state, float(estimate["acceleration"]), steering_angle + offset
@@ -136,7 +136,7 @@ class Controller:
             self._drive(observation, steering_angle, offset)
 
     def _follow(self, x: float, y: float) -> None:
-        """Find the place on the path again after estimates that were missed."""
+        """Find the place on the path again if estimates were missed."""
         moved = math.hypot(x - self._place[0], y - self._place[1])
         if FAR < moved < math.inf:
             near = self._observer.arc_length + moved
@@ -173,7 +173,7 @@ class Controller:
         self._in_a_row = 0
 
     def brake_on_stale(self) -> None:
-        """Set a command to brake for lack of an estimate: steering as it was, slower and slower."""
+        """Set a command to brake for lack of estimates: steering held, speed extrapolated."""
         if self.command["reason"] == STALE_ESTIMATE:
             a = float(self.command["acceleration"]) - self._vehicle.rolling_deceleration
             self._speed = max(self._speed + a * self._period, 0.0)

@@ -1,4 +1,4 @@
-"""The estimator's process: samples in, an estimate out once every control period."""
+"""The estimator's process: samples in, one estimate out per control period."""
 
 import math
 from collections.abc import Callable
@@ -13,22 +13,22 @@ from lpv_track_env import vehicle
 from lpv_track_env.conditions.layout import WORST_OFFSET
 from lpv_track_env.estimation.estimator import Estimator
 
-LOOK = 0.02
-"""s between looks at the link while no sample comes."""
+LINK_PERIOD = 0.02
+"""Time between checks of the link while no sample arrives, s."""
 
 
 class Filter(Protocol):
-    """What makes estimates of samples."""
+    """Computes estimates from samples."""
 
     def take(self, sample: Any) -> None:
         """Take in a SAMPLE record."""
 
-    def tell(self, record: Any) -> None:
+    def write(self, record: Any) -> None:
         """Write state, deviation and counts into an ESTIMATE record."""
 
 
 class Truth:
-    """Passes on what the vehicle really does."""
+    """Passes on the true state."""
 
     def __init__(self, setup: Setup) -> None:
         del setup
@@ -38,13 +38,13 @@ class Truth:
         """Take in a SAMPLE record."""
         self._state = sample["truth"]
 
-    def tell(self, record: Any) -> None:
+    def write(self, record: Any) -> None:
         """Write the true state into an ESTIMATE record."""
         record["state"] = self._state
 
 
 class Ekf:
-    """The project's extended Kalman filter."""
+    """Extended Kalman filter of the environment."""
 
     def __init__(self, setup: Setup) -> None:
         self._calibrate = setup.known_conditions.calibrate_steering
@@ -73,7 +73,7 @@ class Ekf:
         if not math.isnan(stamp):
             self._estimator.take_fix(stamp, x, y)
 
-    def tell(self, record: Any) -> None:
+    def write(self, record: Any) -> None:
         """Write state, deviation and counts into an ESTIMATE record."""
         estimator = self._estimator
         counts = estimator.counts
@@ -93,11 +93,11 @@ class Ekf:
 
 
 FILTERS: dict[str, Callable[[Setup], Filter]] = {"ekf": Ekf, "truth": Truth}
-"""By name, as `--estimator` takes it."""
+"""Filters by their name in `--estimator`."""
 
 
 def estimate(link: Link, setup: Setup, samples: Reader, estimates: Writer) -> None:
-    """Estimate until the supervisor stops it; an estimate goes out with each control period."""
+    """Send an estimate each control period until the supervisor stops the process."""
     with samples, estimates:
         link.say(ATTACHED)
         make = FILTERS[setup.estimator]
@@ -110,10 +110,10 @@ def estimate(link: Link, setup: Setup, samples: Reader, estimates: Writer) -> No
 
 
 def serve(link: Link, chosen: Filter, samples: Reader, estimates: Writer, record: Any) -> None:
-    """Take in samples as they come; those that piled up all before the next estimate."""
+    """Take in samples as they arrive, all waiting ones before the next estimate."""
     published, last, lost = -1, 0, 0
     while not link.stopped():
-        for message in samples.wait_all(LOOK):
+        for message in samples.wait_all(LINK_PERIOD):
             lost += message.sequence - last - 1
             last = message.sequence
             sample = message.value
@@ -124,12 +124,12 @@ def serve(link: Link, chosen: Filter, samples: Reader, estimates: Writer, record
         for name in ("period", "taken", "time", "acceleration", "steering_angle"):
             record[name] = sample[name]
         record["samples_lost"] = lost
-        chosen.tell(record)
+        chosen.write(record)
         estimates.put(record)
 
 
 def warm_up(chosen: Filter, record: Any) -> None:
-    """Have everything compiled that a run needs."""
+    """Compile everything that a run needs."""
     sample = np.zeros((), SAMPLE)
     sample["speed"] = 5.0
     for k in range(20):
@@ -137,4 +137,4 @@ def warm_up(chosen: Filter, record: Any) -> None:
         sample["fix_time"] = sample["time"]
         sample["fix_x"] = 0.05 * k
         chosen.take(sample)
-    chosen.tell(record)
+    chosen.write(record)

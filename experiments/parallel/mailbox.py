@@ -1,26 +1,25 @@
-"""A latest-value mailbox between processes: one writer, readers that never wait for it.
+"""A latest-value mailbox between processes: one writer, and readers that never block it.
 
 The values lie in `multiprocessing.shared_memory`: a sequence number, and a few slots used in turn::
 
     0    uint64   sequence number of the newest complete value, 0 before the first
     64   slots    each [uint64 sequence, int64 stamp, uint64 checksum, value], in lines of 64 bytes
 
-Value n goes to slot n modulo their number; the sequence number at the front is written last, after
-which a byte into a pipe wakes the one reader that waits. There is no lock, so a writer that is
-killed at any instruction holds none: the front still names the last complete value, in another slot
-than the torn one.
+Value n goes to slot n modulo the number of slots. The sequence number at the front is written last;
+then a byte into a pipe wakes the one reader that waits. There is no lock that a killed writer could
+hold: whenever it is killed, the front still names the last complete value, in another slot than the
+torn one.
 
-What a reader takes for whole does not depend on the order in which its processor sees these
-writes (x86 keeps it, ARM does not, and Python has no fence to ask for it): a copied slot counts
-only if it has the sequence number asked for and the CRC-32 over sequence, stamp and value fits.
-Otherwise the writer came round meanwhile, or its bytes are not all to be seen yet, and the reader
-looks again.
+Readers do not rely on the order in which their processor sees these writes (x86 keeps it, ARM does
+not, and Python has no memory fence). A copied slot is valid only if it has the expected sequence
+number and the CRC-32 over sequence, stamp and value matches. Otherwise the writer has reused the
+slot, or not all of its bytes are visible yet, and the reader tries again.
 
-The name in /dev/shm is needed only until every process has attached: `Mailbox.unlink` then takes it
-away, and the system frees the memory with the last process, however that ends. Until then
-multiprocessing's resource tracker stands by, of which children started by multiprocessing share
-their parent's (attaching registers there once more, which is without effect; a tracker of its own
-would remove the mailbox when such a child ends).
+The name in /dev/shm is needed only until every process has attached: `Mailbox.unlink` then removes
+it, and the system frees the memory with the last process, however that ends. Until then
+multiprocessing's resource tracker would remove it. Children started by multiprocessing share their
+parent's tracker, where attaching registers the same name again, without effect; a tracker of its
+own would remove the mailbox when such a child ends.
 """
 
 import os
@@ -42,38 +41,38 @@ CHECKSUM = struct.Struct("=Q")
 HEAD = struct.Struct("=QqQ")
 """Sequence number and stamp, which are checked with the value, and their checksum."""
 ATTEMPTS = 10_000
-"""Copies that a reader makes of a value that is being overwritten, before it gives up."""
+"""Attempts of a reader to copy a value that is being overwritten."""
 
 
 class Message(NamedTuple):
-    """A complete value as it was written."""
+    """A complete value."""
 
     sequence: int
     """1 for the first value, then one more for each."""
     stamp: int
-    """`time.monotonic_ns()` of the writer when it was written; one clock for all processes."""
+    """`time.monotonic_ns()` at the time of writing; all processes share this clock."""
     value: Any
     """A numpy record (np.void) of the mailbox's dtype, read-only."""
 
 
 class MailboxError(RuntimeError):
-    """A mailbox's memory does not hold what its sequence number says."""
+    """The memory of a mailbox does not hold the value that its sequence number names."""
 
 
 class Mailbox:
-    """The mailbox's memory and pipe, in the process that makes them and hands out the ends.
+    """Memory and pipe of a mailbox, in the process that creates them and hands out the ends.
 
-    The ends are given to processes as arguments of `multiprocessing.Process` (spawn); each calls
-    `open` (or says `with`) where it is used and `close` where it is not. `unlink` comes once all
-    have opened theirs.
+    The ends are passed to processes as arguments of `multiprocessing.Process` (spawn). A process
+    opens the end that it uses (`open` or `with`) and closes the other; once all ends are open,
+    `unlink` is called.
 
     Parameters
     ----------
     dtype
-        Of a value: a numpy structured type without objects.
+        Type of a value: a numpy structured type without objects.
     slots
-        How many values are kept: more than 2 make it rarer that a reader has to look again, and let
-        `Reader.wait_all` have those in between.
+        Number of values kept. More than 2 make retries of a reader rarer, and `Reader.wait_all`
+        returns those in between.
 
     Raises
     ------
@@ -87,7 +86,6 @@ class Mailbox:
         if slots < 2:
             raise ValueError(f"a mailbox needs at least 2 slots, not {slots}")
         self.dtype, self.slots = dtype, slots
-        # A name that tells whose it is, should anybody ever look.
         name = f"lpv-track-{os.getpid()}-{secrets.token_hex(4)}"
         self._memory = SharedMemory(name, create=True, size=FRONT + slots * _stride(dtype))
         self._linked = True
@@ -96,20 +94,20 @@ class Mailbox:
             os.set_blocking(connection.fileno(), False)
         self.writer = Writer(name, dtype, slots, waking)
         self.reader = Reader(name, dtype, slots, waiting)
-        """The one reader that can wait."""
+        """The only reader that can wait."""
 
     def watcher(self) -> "Reader":
-        """A further reader, which can look but not wait."""
+        """Return a further reader, which can read but not wait."""
         return Reader(self._memory.name, self.dtype, self.slots, None)
 
     def unlink(self) -> None:
-        """Take the name away; nothing can be opened after that."""
+        """Remove the name; no end can be opened after that."""
         if self._linked:
             self._linked = False
             self._memory.unlink()
 
     def close(self) -> None:
-        """Close both ends as far as they are this process's, and unlink."""
+        """Close both ends in this process, and unlink."""
         self.writer.close()
         self.reader.close()
         self.unlink()
@@ -117,7 +115,7 @@ class Mailbox:
 
 
 class _End:
-    """What writer and reader share: the memory's views, made by `open`."""
+    """Common part of writer and reader: the views of the memory that `open` creates."""
 
     def __init__(
         self, name: str, dtype: np.dtype[Any], slots: int, connection: Connection | None
@@ -130,7 +128,7 @@ class _End:
         self._front: Any = None
 
     def open(self) -> Self:
-        """Attach to the memory, in the process that is to use this end.
+        """Attach to the memory, in the process that uses this end.
 
         Raises
         ------
@@ -150,7 +148,7 @@ class _End:
         self.close()
 
     def close(self) -> None:
-        """Detach and close this process's end of the pipe."""
+        """Detach, and close this process's end of the pipe."""
         if self._memory is not None:
             self._front.release()
             self._buffer = self._front = None
@@ -162,10 +160,10 @@ class _End:
 
 
 class Writer(_End):
-    """The end that writes; there is one."""
+    """The writing end; there is one."""
 
     def put(self, record: np.ndarray[Any, Any]) -> int:
-        """Write a value, an array () of the mailbox's dtype; returns its sequence number."""
+        """Write a value, an array () of the mailbox's dtype; return its sequence number."""
         value = record.tobytes()
         sequence = self._front[0] + 1
         checked = CHECKED.pack(sequence, time.monotonic_ns())
@@ -182,8 +180,8 @@ class Writer(_End):
         try:
             os.write(self._connection.fileno(), b"\0")
         except BlockingIOError:
-            pass  # The pipe is full of wakes that the reader has not looked at.
-        except BrokenPipeError:  # Nobody waits any more.
+            pass  # The pipe is full of wakes that the reader has not read.
+        except BrokenPipeError:  # The reader is gone.
             self._connection.close()
             self._connection = None
 
@@ -196,17 +194,17 @@ class Reader(_End):
     ) -> None:
         super().__init__(name, dtype, slots, connection)
         self.taken = 0
-        """Sequence number of the newest value that was given out."""
+        """Sequence number of the newest value that was returned."""
         self.writer_gone = False
-        """Whether a wait has found that no process has the writing end open any more."""
+        """True once a wait has found that no process has the writing end open."""
 
     def latest(self) -> Message | None:
-        """The newest complete value, given out before or not; None before the first.
+        """Return the newest complete value, read before or not; None before the first.
 
         Raises
         ------
         MailboxError
-            If no copy was whole in thousands of attempts.
+            If no copy was valid in thousands of attempts.
         """
         for _ in range(ATTEMPTS):
             sequence = self._front[0]
@@ -218,7 +216,7 @@ class Reader(_End):
         raise MailboxError("a mailbox's newest value is not whole: its memory was written over")
 
     def wait(self, timeout: float) -> Message | None:
-        """The newest value that was not given out yet; None if none comes within `timeout` s."""
+        """Return the newest unread value; None if none arrives within `timeout` s."""
         if not self._wait(timeout):
             return None
         message = self.latest()
@@ -227,9 +225,9 @@ class Reader(_End):
         return message
 
     def wait_all(self, timeout: float) -> list[Message]:
-        """All values not given out yet that are still there, oldest first; [] after `timeout` s.
+        """Return all unread values that are still there, oldest first; [] after `timeout` s.
 
-        Sequence numbers tell what was lost in between.
+        Gaps in the sequence numbers show values that were lost.
         """
         if not self._wait(timeout):
             return []
@@ -237,7 +235,7 @@ class Reader(_End):
         first = max(self.taken + 1, newest - self._slots + 1)
         copies = [self._copy(sequence) for sequence in range(first, newest + 1)]
         messages = [message for message in copies if message is not None]
-        if not messages:  # All were written over while they were copied.
+        if not messages:  # All were overwritten while they were copied.
             message = self.latest()
             assert message is not None
             messages = [message]
@@ -245,7 +243,7 @@ class Reader(_End):
         return messages
 
     def _wait(self, timeout: float) -> bool:
-        """Whether there is a value that was not given out, after at most `timeout` s."""
+        """Wait up to `timeout` s for an unread value; return whether there is one."""
         deadline = time.monotonic() + timeout
         while self._front[0] <= self.taken:
             left = deadline - time.monotonic()
@@ -254,14 +252,14 @@ class Reader(_End):
             if self._connection is None or self.writer_gone:
                 time.sleep(left)
                 continue
-            # Of poll, epoll and select only the last has a timeout finer than milliseconds.
+            # Unlike poll and epoll, select has a timeout finer than milliseconds.
             ready, _, _ = select.select([self._connection], [], [], left)
             if ready and not os.read(self._connection.fileno(), 4096):
                 self.writer_gone = True
         return True
 
     def _copy(self, sequence: int) -> Message | None:
-        """One value, if it is whole and still there."""
+        """Return the value of a sequence number if it is complete and still there."""
         offset = FRONT + sequence % self._slots * self._stride
         size = HEAD.size + self._dtype.itemsize
         content = bytes(self._buffer[offset : offset + size])
@@ -273,5 +271,5 @@ class Reader(_End):
 
 
 def _stride(dtype: np.dtype[Any]) -> int:
-    """Bytes from slot to slot: whole lines, so that two slots share none."""
+    """Return the bytes from slot to slot: whole cache lines, so that slots share none."""
     return -(-(HEAD.size + dtype.itemsize) // LINE) * LINE

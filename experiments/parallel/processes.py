@@ -1,8 +1,8 @@
-"""Child processes that end with their parent, and that tell why they ended.
+"""Child processes that end with their parent and report why they ended.
 
-Each child has a link to the supervisor, a pipe: through it the child says that it has attached to
-its mailboxes, that it is ready, or what it failed of; the supervisor's closing it means stop, and
-so does the supervisor's death.
+Each child has a pipe to the supervisor, its link. Through it the child reports that it has attached
+to its mailboxes, that it is ready, or its failure. The child stops when the supervisor closes the
+link or dies.
 """
 
 import ctypes
@@ -22,7 +22,7 @@ ATTACHED, READY, FAILED = "attached", "ready", "failed"
 DEATH_SIGNAL, TIMER_SLACK = 1, 29
 """prctl's PR_SET_PDEATHSIG and PR_SET_TIMERSLACK."""
 GRACE = 0.5
-"""s that a child has to end by itself, and then to die of SIGTERM, before it is killed."""
+"""Time that a child has to end by itself, and again after SIGTERM, before it is killed, s."""
 
 
 class Link:
@@ -32,12 +32,12 @@ class Link:
         self._connection = connection
 
     def say(self, word: str, detail: str = "") -> None:
-        """Tell the supervisor; without effect where it is gone."""
+        """Send a word to the supervisor; no effect if it is gone."""
         with suppress(OSError):
             self._connection.send((word, detail))
 
     def stopped(self) -> bool:
-        """Whether the supervisor wants the child to end, or is gone itself."""
+        """Return whether the supervisor has closed the link or is gone."""
         ready, _, _ = select.select([self._connection], [], [], 0.0)
         return bool(ready)
 
@@ -46,32 +46,31 @@ Role = Callable[..., None]
 
 
 def child_main(role: Role, connection: Connection, parent: int, arguments: tuple[Any, ...]) -> None:
-    """Run a role in a child: `role(link, *arguments)`; what it raises goes to the supervisor."""
+    """Run `role(link, *arguments)` in a child; report its exception to the supervisor."""
     end_with(parent)
-    # Ctrl-C reaches the whole group: the supervisor, which brakes first, decides when to end.
+    # Ctrl-C reaches the whole process group, but the supervisor must brake first.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     link = Link(connection)
     try:
         role(link, *arguments)
-    except Exception as error:  # noqa: BLE001  told to the supervisor, which ends the run
+    except Exception as error:  # noqa: BLE001  reported to the supervisor, which ends the run
         link.say(FAILED, f"{type(error).__name__}: {' '.join(str(error).split())}")
         sys.exit(1)
 
 
 def end_with(parent: int) -> None:
-    """Have the system kill this process when its parent dies, where the system can (Linux).
+    """Let the system kill this process when its parent dies (Linux only).
 
-    Elsewhere a child ends when it next looks at its link, so one that hangs outlives a parent that
-    is killed.
+    Elsewhere a child ends when it next checks its link, so a hung child outlives a killed parent.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:  # It died before that.
+    if os.getppid() != parent:  # The parent died before the call.
         sys.exit(1)
 
 
 def quiet() -> None:
-    """Before a loop that must not be late: no garbage collector, timers to the microsecond."""
+    """Prepare a real-time loop: no garbage collection, timers accurate to the microsecond."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -88,16 +87,16 @@ def no_longer_quiet() -> None:
 
 
 class Child:
-    """The supervisor's view of a child process.
+    """A child process, as the supervisor handles it.
 
     Parameters
     ----------
     name
-        Of the role, for messages.
+        Name of the role, for messages.
     context
-        multiprocessing's, spawn.
+        Context of multiprocessing, spawn.
     role, arguments
-        What it runs: `role(link, *arguments)`, a function of a module.
+        Function of a module and its arguments: the child runs `role(link, *arguments)`.
     """
 
     def __init__(
@@ -113,7 +112,7 @@ class Child:
         theirs.close()
 
     def heard(self, word: str) -> bool:
-        """Whether the child has said a word."""
+        """Return whether the child has sent a word."""
         self._listen()
         return word in self._heard
 
@@ -125,11 +124,11 @@ class Child:
 
     @property
     def dead(self) -> bool:
-        """Whether the process has ended."""
+        """True once the process has ended."""
         return self.process.exitcode is not None
 
     def cause_of_death(self) -> str:
-        """How a dead child ended, in words."""
+        """Return how a dead child ended, in words."""
         code = self.process.exitcode
         if self.heard(FAILED):
             return f"failed: {self._heard[FAILED]}"
@@ -143,7 +142,7 @@ class Child:
         self._connection.close()
 
     def end(self) -> None:
-        """Wait for the child, which was asked to stop; make it end if it does not."""
+        """Ask the child to stop and wait for it; terminate or kill it if it does not."""
         if not self._connection.closed:
             self.ask_to_stop()
         for make_end in (self.process.terminate, self.process.kill):
@@ -156,19 +155,19 @@ class Child:
 
 
 class Stop:
-    """SIGINT and SIGTERM, remembered until the loop looks.
+    """SIGINT and SIGTERM, remembered for the loop to check.
 
     Raises
     ------
     ValueError
-        On entering outside of the main thread, where Python takes no signals.
+        On entering outside of the main thread, where Python handles no signals.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self) -> None:
         self.number = 0
-        """Of the first signal that came; 0 for none."""
+        """Number of the first signal; 0 for none."""
         self._before: list[Any] = []
 
     def __enter__(self) -> "Stop":
@@ -184,7 +183,7 @@ class Stop:
 
 
 def wait_until(condition: Callable[[], bool], timeout: float, stop: Stop) -> bool:
-    """Wait for a condition, a few ms at a time; False after `timeout` s or when a signal came."""
+    """Wait for a condition; return False after `timeout` s or on a signal."""
     deadline = time.monotonic() + timeout
     while not condition():
         if stop.number or time.monotonic() > deadline:

@@ -1,4 +1,4 @@
-"""The process that is the vehicle, in real time, and that watches over the other two."""
+"""The supervisor: simulates the vehicle in real time and monitors the other two processes."""
 
 import multiprocessing
 import signal
@@ -32,29 +32,29 @@ from experiments.parallel.setup import (
 from experiments.parallel.vehicle import Sensors, Vehicle
 
 START_TIMEOUT = 180.0
-"""s until both processes must be ready: importing, and compiling where numba's cache is empty."""
+"""Time for both processes to import, and to compile if numba's cache is empty, s."""
 LEAD = 50 * MS
-"""ns from readiness to the first deadline."""
+"""Time from readiness to the first deadline, ns."""
 SAMPLE_SLOTS = 64
-"""Samples that wait for an estimator that is late."""
+"""Number of samples that can wait for a late estimator."""
 
 Say = Callable[[str], None]
 
 
 def run(setup: Setup, say: Say) -> Outcome:
-    """Drive one run; on return no process and no shared memory is left.
+    """Drive one run; no process and no shared memory is left on return.
 
     Parameters
     ----------
     setup
-        The run's.
+        Settings of the run.
     say
-        Takes lines for the user.
+        Function that prints a line for the user.
 
     Raises
     ------
     ValueError
-        Outside of the main thread, which alone is told of signals.
+        Outside of the main thread, the only one that handles signals.
     """
     with Stop() as stop:
         supervisor = Supervisor(setup, stop)
@@ -79,13 +79,13 @@ class Supervisor:
         self._fault = ""
         self._origin = 0
         self._sample = np.zeros((), SAMPLE)
-        self._handed_out: list[int] = []
-        """When the sample of each control period was handed out, ns."""
+        self._publish_times: list[int] = []
+        """Time at which the sample of each control period was published, ns."""
         self._answered = -1
-        """Number of the last control period that a command answers."""
+        """Number of the last control period with a command."""
 
     def start(self, say: Say) -> None:
-        """Start both processes and wait until they are ready; what fails is kept as the fault."""
+        """Start both processes and wait until they are ready; keep a failure as the fault."""
         context = multiprocessing.get_context("spawn")
         for dtype, slots in ((SAMPLE, SAMPLE_SLOTS), (ESTIMATE, 4), (COMMAND, 4)):
             self._mailboxes.append(Mailbox(dtype, slots=slots))
@@ -99,35 +99,35 @@ class Supervisor:
             ("controller", control, (estimates.reader, commands.writer)),
         ):
             self._children.append(Child(name, context, role, (self.setup, *ends)))
-        # So that a reader sees when its writer is gone, and the other way round.
+        # Only the children hold these ends, so that each sees when the other is gone.
         for end in (samples.reader, estimates.writer, estimates.reader, commands.writer):
             end.close()
-        if self._all_say(ATTACHED):
+        if self._all_report(ATTACHED):
             for mailbox in self._mailboxes:
                 mailbox.unlink()
-        if self._all_say(READY):
+        if self._all_report(READY):
             names = [f"{child.name} {child.process.pid}" for child in self._children]
             say(f"processes: {', '.join(names)}; the clock runs")
 
-    def _all_say(self, word: str) -> bool:
-        """Wait for a word from both children; False where a fault or a signal came first."""
+    def _all_report(self, word: str) -> bool:
+        """Wait for a word from both children; return False on a fault or a signal."""
 
-        def told_or_dead() -> bool:
+        def heard_or_dead() -> bool:
             return all(child.heard(word) for child in self._children) or any(
                 child.dead for child in self._children
             )
 
         if self._fault or self._stop.number:
             return False
-        if not wait_until(told_or_dead, START_TIMEOUT, self._stop):
+        if not wait_until(heard_or_dead, START_TIMEOUT, self._stop):
             if not self._stop.number:
                 self._fault = f"the processes were not {word} after {START_TIMEOUT:g} s"
             return False
-        self._look_for_the_dead()
+        self._check_for_dead()
         return not self._fault
 
     def drive(self) -> Outcome:
-        """Be the vehicle until time, path or a fault ends it; then stop it and the processes."""
+        """Simulate the vehicle until time, path or a fault ends the drive; then stop everything."""
         end = ""
         if not self._fault and not self._stop.number:
             quiet()
@@ -152,7 +152,7 @@ class Supervisor:
         )
 
     def _loop(self) -> str:
-        """One turn per tick: commands as they come, then what the vehicle's clock asks for."""
+        """Run tick by tick: apply commands as they arrive, then advance and publish a sample."""
         setup, vehicle = self.setup, self._vehicle
         self._origin = time.monotonic_ns() + LEAD
         ms = 0
@@ -176,12 +176,12 @@ class Supervisor:
             self._publish(ms, due)
             if begins:
                 self._keep_estimate()
-                self._look_for_the_dead()
-                self._look_for_the_hung()
+                self._check_for_dead()
+                self._check_for_hung()
             ms += setup.tick_ms
 
     def _end(self, ms: int) -> str:
-        """Why the drive ends at the beginning of this period, or ""."""
+        """Return why the drive ends at the beginning of this period, or ""."""
         if self._stop.number:
             return "signal"
         if self._vehicle.end is not None:
@@ -191,7 +191,7 @@ class Supervisor:
         return "seconds" if ms >= MS_PER_SECOND * self.setup.seconds else ""
 
     def _apply(self, message: Message, tick_ms: int) -> None:
-        """Give the vehicle a command at the moment at which it came, by the next tick at most."""
+        """Give the vehicle a command at the time of its arrival, at the latest at the next tick."""
         value = message.value
         now = time.monotonic_ns()
         self._vehicle.advance(min(1e-9 * (now - self._origin), tick_ms / MS_PER_SECOND))
@@ -202,7 +202,7 @@ class Supervisor:
         )  # fmt: skip
         if accepted:
             self._answered = int(value["period"])
-            # It is in force from the vehicle's next cycle on.
+            # The command takes effect with the vehicle's next cycle.
             applied = max(self._origin + round(1e9 * self._vehicle.time), now)
             self._recording.commands.append(
                 (
@@ -223,23 +223,23 @@ class Supervisor:
         self._sensors.read(ms, state, sample)
         self._samples.put(sample)
         if ms % self.setup.period_ms == 0:
-            self._handed_out.append(time.monotonic_ns())
+            self._publish_times.append(time.monotonic_ns())
 
     def _keep_estimate(self) -> None:
         message = self._estimates.latest()
         if message is not None:
             self._recording.estimates[int(message.value["period"])] = message.value
 
-    def _look_for_the_dead(self) -> None:
+    def _check_for_dead(self) -> None:
         for child in self._children:
             if not self._fault and child.dead:
                 self._fault = f"the {child.name} {child.cause_of_death()}"
 
-    def _look_for_the_hung(self) -> None:
-        """Take a process for hung that has left samples unanswered for too long.
+    def _check_for_hung(self) -> None:
+        """Set the fault if a process has left samples unanswered for too long.
 
-        Time counts from when a sample was handed out, so a vehicle that is late itself blames
-        nobody.
+        Time counts from the publication of a sample, so a vehicle that is itself late blames no
+        other process.
         """
         if self._fault or self._vehicle.braking is None:
             return
@@ -253,13 +253,13 @@ class Supervisor:
         self._fault = f"the {name} hangs: no {what} for {silence:.2f} s"
 
     def _silence(self, answered: int) -> float:
-        """Time for which the first sample after period `answered` has been waiting, s."""
-        if answered + 1 >= len(self._handed_out):
+        """Return how long the first sample after period `answered` has been waiting, s."""
+        if answered + 1 >= len(self._publish_times):
             return 0.0
-        return 1e-9 * (time.monotonic_ns() - self._handed_out[answered + 1])
+        return 1e-9 * (time.monotonic_ns() - self._publish_times[answered + 1])
 
     def close(self) -> None:
-        """End both processes and remove the mailboxes, whatever state they are in."""
+        """End both processes and remove the mailboxes, whatever their state."""
         for child in self._children:
             child.end()
         for watcher in self._watchers:

@@ -1,6 +1,5 @@
 """Sections that compare agents: with the published table, and by the path's curvature."""
 
-import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -8,10 +7,13 @@ from experiments.report.charts import BOTTOM, TOP, Chart, Scale, decades
 from experiments.report.computing import TRAINED_NOTE
 from experiments.report.drives import Result, family_of, main_family, per_setting
 from experiments.report.page import (
+    Cell,
     Document,
     Panel,
     Styles,
     folded,
+    html_groups,
+    html_table,
     joined,
     legend,
     paragraph,
@@ -178,40 +180,16 @@ def _trained(row: Row) -> str:
 def html_rows(
     rows: Sequence[Row], columns: Sequence[Column], texts: Mapping[str, Callable[[Row], str]]
 ) -> str:
-    """Return an HTML table of one setting: trajectory, agent, numeric columns, columns of text.
-
-    Every line names its trajectory, so that lines keep their meaning when they are sorted; the
-    style sheet hides repetitions where lines are grouped.
-    """
-    heads = "".join(
-        f'<th class="n" scope="col">{html.escape(column.heading)} '
-        f"<small>{html.escape(column.unit)}</small></th>"
-        for column in columns
-    ) + "".join(f'<th scope="col">{html.escape(heading)}</th>' for heading in texts)
+    """Return an HTML table of one setting: path, agent, numeric columns, columns of text."""
+    units = [(column.heading, column.unit) for column in columns]
+    headings: list[Cell] = ["path", "agent", *units, *texts]
+    prose = 2 + len(columns)
     lines = []
-    seen = ""
     for row in rows:
-        first = row.trajectory != seen
-        seen = row.trajectory
-        classes = " ".join(
-            name for name, on in (("published", row.published), ("first", first)) if on
-        )
-        cells = "".join(
-            f'<td class="n">{html.escape(column.text(row))}</td>' for column in columns
-        ) + "".join(f'<td class="t">{html.escape(words(row))}</td>' for words in texts.values())
-        label = html.escape(row.label + (f" ×{row.runs}" if row.runs > 1 else ""))
-        mark = f' class="{classes}"' if classes else ""
-        lines.append(
-            f'<tr{mark}><td class="path">{html.escape(tables.path_name(row.trajectory))}</td>'
-            f'<th class="who" scope="row">{label}</th>{cells}</tr>'
-        )
-    longest = max((len(tables.path_name(row.trajectory)) for row in rows), default=4)
-    body = "\n".join(lines)
-    return (
-        f'<table class="grouped" style="--path: {min(max(longest, 4), 9)}ch"><thead><tr>'
-        f'<th class="path" scope="col">path</th><th class="who" scope="col">agent</th>{heads}'
-        f"</tr></thead>\n<tbody>\n{body}\n</tbody></table>"
-    )
+        label = row.label + (f" ×{row.runs}" if row.runs > 1 else "")
+        cells = [column.text(row) for column in columns] + [text(row) for text in texts.values()]
+        lines.append(([tables.path_name(row.trajectory), label, *cells], row.published))
+    return html_groups(headings, lines, range(2, prose), range(prose, len(headings)))
 
 
 def curvature_section(document: Document, cases: Sequence[Result], styles: Styles) -> str:
@@ -224,13 +202,7 @@ def curvature_section(document: Document, cases: Sequence[Result], styles: Style
     if not lines:
         return ""
     family = main_family(cases)
-    own = {
-        setting: lines[setting]
-        for setting in dict.fromkeys(
-            tables.setting_of(case) for case in cases if family_of(case) == family
-        )
-        if setting in lines
-    }
+    own = {setting: found for setting, found in lines.items() if setting.family == family}
     figure = ""
     if own:
         figure = document.figure(
@@ -273,22 +245,11 @@ def by_band(lines: Mapping[str, Sequence[Line]], styles: Styles) -> list[Panel]:
 
 
 def _band_table(lines: Iterable[Line]) -> str:
-    heads = "".join(
-        f'<th class="n" scope="col">{html.escape(name)}<small>{html.escape(words)} 1/m</small></th>'
-        for name, words in zip(BANDS.names, band_ranges(), strict=True)
-    )
-    body = "\n".join(
-        f'<tr><th class="who" scope="row">{html.escape(label)}</th>'
-        + "".join(
-            f'<td class="n">{cell.error}<small>{html.escape(cell.basis)}</small></td>'
-            if cell
-            else '<td class="n">–</td>'
-            for cell in cells
-        )
-        + "</tr>"
-        for label, cells in lines
-    )
-    return (
-        f'<table><thead><tr><th class="who" scope="col">agent</th>{heads}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody></table>"
-    )
+    headings = [
+        (name, f"{words} 1/m") for name, words in zip(BANDS.names, band_ranges(), strict=True)
+    ]
+    cells = [
+        [label, *((cell.error, cell.basis) if cell else "–" for cell in found)]
+        for label, found in lines
+    ]
+    return html_table(headings, cells, range(1, len(headings)))

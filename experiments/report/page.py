@@ -6,14 +6,13 @@
 import base64
 import hashlib
 import html
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 from string import Template
 
 from experiments.figures import COLOURS
-from experiments.run.tables import Column, Row
 
 PAGE = Template("""<!DOCTYPE html>
 <html lang="en">
@@ -238,70 +237,65 @@ def _caption(number: str, place: str, text: str) -> str:
     )
 
 
+Cell = str | tuple[str, str]
+"""Text of a table's cell, or text and a remark in small print."""
+
+
 def html_table(
-    headings: Sequence[str],
-    lines: Iterable[Sequence[str]],
+    headings: Sequence[Cell],
+    lines: Iterable[Sequence[Cell]],
     numeric: Iterable[int] = (),
     wrapped: Iterable[int] = (),
 ) -> str:
-    """Return an HTML table of text cells, all escaped; the first column heads its line.
+    """Return an HTML table of cells, all escaped; the first column heads its line.
 
     Columns `numeric` are aligned right; columns `wrapped` hold prose and break into lines.
     """
-    right, prose = set(numeric), set(wrapped)
-
-    def cell(place: int, text: str, tag: str, more: str = "") -> str:
-        kind = "n" if place in right else "t" if place in prose else ""
-        mark = f' class="{kind}"' if kind else ""
-        return f"<{tag}{more}{mark}>{html.escape(text)}</{tag}>"
-
-    head = "".join(cell(k, text, "th", ' scope="col"') for k, text in enumerate(headings))
-    body = "\n".join(
-        "<tr>"
-        + "".join(
-            cell(k, text, "td") if k else cell(k, text, "th", ' scope="row"')
-            for k, text in enumerate(line)
-        )
-        + "</tr>"
-        for line in lines
-    )
-    return f"<table><thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table>"
+    kinds = {**dict.fromkeys(numeric, "n"), **dict.fromkeys(wrapped, "t")}
+    return _table(headings, ((line, "") for line in lines), kinds)
 
 
-def html_rows(
-    rows: Sequence[Row], columns: Sequence[Column], texts: Mapping[str, Callable[[Row], str]]
-) -> str:
-    """Return an HTML table of one setting: trajectory, agent, numeric columns, columns of text.
+def html_groups(
+    headings: Sequence[Cell], lines: Sequence[tuple[Sequence[Cell], bool]], numeric: Iterable[int],
+    wrapped: Iterable[int],
+) -> str:  # fmt: skip
+    """Return an HTML table of lines, (cells, published) each, grouped by the first column, a path.
 
-    Every line names its trajectory, so that lines keep their meaning when they are sorted; the
-    style sheet hides repetitions where lines are grouped.
+    Every line names its path, so that lines keep their meaning when they are sorted; the style
+    sheet hides repetitions where lines are grouped.
     """
-    heads = "".join(
-        f'<th class="n" scope="col">{html.escape(column.heading)} '
-        f"<small>{html.escape(column.unit)}</small></th>"
-        for column in columns
-    ) + "".join(f'<th scope="col">{html.escape(heading)}</th>' for heading in texts)
-    lines = []
-    seen = ""
-    for row in rows:
-        first = row.trajectory != seen
-        seen = row.trajectory
-        classes = " ".join(
-            name for name, on in (("published", row.published), ("first", first)) if on
-        )
+    kinds = {**dict.fromkeys(numeric, "n"), **dict.fromkeys(wrapped, "t"), 0: "path", 1: "who"}
+    paths = [cells[0] for cells, _ in lines]
+    marked = [
+        (cells, " ".join(["published"] * published + ["first"] * (k == 0 or path != paths[k - 1])))
+        for k, ((cells, published), path) in enumerate(zip(lines, paths, strict=True))
+    ]
+    width = min(max(map(len, paths), default=4), 9)
+    return _table(headings, marked, kinds, f' class="grouped" style="--path: {max(width, 4)}ch"', 1)
+
+
+def _table(
+    headings: Sequence[Cell],
+    lines: Iterable[tuple[Sequence[Cell], str]],
+    kinds: Mapping[int, str],
+    attributes: str = "",
+    label: int = 0,
+) -> str:
+    """Return a table of lines, (cells, class) each; column `label` heads its line."""
+
+    def cell(place: int, content: Cell, tag: str, scope: str = "") -> str:
+        text, small = content if isinstance(content, tuple) else (content, "")
+        remark = f" <small>{html.escape(small)}</small>" if small else ""
+        mark = f' class="{kinds[place]}"' if place in kinds else ""
+        return f"<{tag}{scope}{mark}>{html.escape(text)}{remark}</{tag}>"
+
+    head = "".join(cell(k, content, "th", ' scope="col"') for k, content in enumerate(headings))
+    rows = []
+    for line, kind in lines:
         cells = "".join(
-            f'<td class="n">{html.escape(column.text(row))}</td>' for column in columns
-        ) + "".join(f'<td class="t">{html.escape(words(row))}</td>' for words in texts.values())
-        label = html.escape(row.label + (f" ×{row.runs}" if row.runs > 1 else ""))
-        mark = f' class="{classes}"' if classes else ""
-        lines.append(
-            f'<tr{mark}><td class="path">{html.escape(row.trajectory)}</td>'
-            f'<th class="who" scope="row">{label}</th>{cells}</tr>'
+            cell(k, content, "th", ' scope="row"') if k == label else cell(k, content, "td")
+            for k, content in enumerate(line)
         )
-    longest = max((len(row.trajectory) for row in rows), default=4)
-    body = "\n".join(lines)
-    return (
-        f'<table class="grouped" style="--path: {min(max(longest, 4), 9)}ch"><thead><tr>'
-        f'<th class="path" scope="col">path</th><th class="who" scope="col">agent</th>{heads}'
-        f"</tr></thead>\n<tbody>\n{body}\n</tbody></table>"
-    )
+        rows.append(f'<tr class="{kind}">{cells}</tr>' if kind else f"<tr>{cells}</tr>")
+    body = "\n".join(rows)
+    return f"<table{attributes}><thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table>"
