@@ -1,9 +1,9 @@
-"""The reference ahead, rebuilt from an observation, and the steady turn that follows it.
+"""Reference ahead, reconstructed from an observation, and the steady turn that follows it.
 
 The preview holds mean curvatures and end speeds over intervals of the reference's own time grid
-(`lpv_track_env.observation`). Integrating them gives the path ahead without any access to it: the
-frame's origin is the foot point, its x axis the path's tangent there, its y axis points left. In
-this frame the vehicle stands at (0, lateral_error) with heading heading_error.
+(`lpv_track_env.observation`). Integrating them gives the path ahead without access to it, in the
+frame with its origin at the foot point, the x axis along the path's tangent there and the y axis to
+the left. In this frame the vehicle is at (0, lateral_error) with heading heading_error.
 """
 
 import math
@@ -18,31 +18,32 @@ from trajectories.compilation import compiled, compiled_internal
 
 Array = NDArray[Any]
 
+# Columns of a node in compiled code, beginning with the NMPC's outputs in their order.
 NODE_SPEED, NODE_HEADING, NODE_X, NODE_Y, NODE_ARC_LENGTH = range(5)
-"""Columns of a node in compiled code: first the NMPC's outputs, in their order."""
 NODE = 5
+"""Number of columns of a node."""
 
 
 class LocalReference(NamedTuple):
-    """K + 1 nodes of the reference, one preview period apart; node 0 is the foot point.
+    """Reference at K + 1 nodes, one preview period apart; node 0 is the foot point.
 
-    Each field is shaped (..., K + 1), with the observation's batch dimensions before it.
+    Each field has the shape (..., K + 1), with the batch dimensions of the observation in front.
     """
 
     arc_length: Array
-    """m from the foot point."""
+    """Distance from the foot point along the path, m."""
     x: Array
-    """m, along the path's tangent at the foot point."""
+    """Position along the path's tangent at the foot point, m."""
     y: Array
-    """m, to the left of it."""
+    """Position to the left of that tangent, m."""
     heading: Array
-    """rad, relative to the heading at the foot point; not wrapped."""
+    """Heading relative to that at the foot point, rad; not wrapped."""
     speed: Array
-    """m/s along the path."""
+    """Speed along the path, m/s."""
 
 
 class LocalPoint(NamedTuple):
-    """A point of the reference ahead, in the frame of the foot point."""
+    """Point of the reference in the frame of the foot point: m, m, rad."""
 
     x: float
     y: float
@@ -50,20 +51,24 @@ class LocalPoint(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """How a vehicle moves whose centre of gravity follows a curve."""
+    """Motion of a vehicle whose centre of gravity follows a curve."""
 
     steering_angle: float
-    """rad."""
+    """Steering angle, rad."""
     sideslip: float
-    """rad, direction of travel minus heading; so on the path the heading error is -sideslip."""
+    """Direction of travel minus heading, rad; on the path, the heading error is -sideslip."""
     yaw_rate: float
-    """rad/s."""
+    """Yaw rate, rad/s."""
     rear_slip: float
-    """rad, direction in which the rear axle travels minus heading."""
+    """Direction of travel of the rear axle minus heading, rad."""
 
 
 def local_reference(observation: TrackingObservation, period: float) -> LocalReference:
-    """Rebuild the reference's nodes from a preview.
+    """Reconstruct the nodes of the reference from the preview of an observation.
+
+    Each interval has constant acceleration, so its length is the mean of its end speeds times the
+    period; and constant curvature, so it is an arc whose chord has the length length * sinc(turn / 2)
+    and the interval's mean heading. The result is exact for a path of such intervals.
 
     Parameters
     ----------
@@ -71,13 +76,6 @@ def local_reference(observation: TrackingObservation, period: float) -> LocalRef
         Scalars shaped (...), previews (..., K).
     period
         Spacing of the preview in the reference's time, s (`ObservationLayout.preview_period`).
-
-    Returns
-    -------
-    LocalReference
-        Nodes shaped (..., K + 1). Interval k has constant acceleration, so its length is the mean
-        of its end speeds times the period, and constant curvature, so it is an arc: its chord is
-        length sinc(turn / 2), along its mean heading. Exact for a path of such intervals.
     """
     curvature = np.asarray(observation.preview_curvature, dtype=np.float64)
     rows = curvature.reshape(-1, curvature.shape[-1])
@@ -100,7 +98,7 @@ def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, no
     """Fill nodes (n + 1, NODE) from the first n intervals of one preview."""
     s = x = y = heading = 0.0
     before = first_speed
-    # Direction of the path at the node before; turned twice by half an interval's angle.
+    # Direction of the path at the node before, turned in two halves of an interval's angle.
     c, d = 1.0, 0.0
     nodes[0, NODE_SPEED], nodes[0, NODE_HEADING], nodes[0, NODE_X] = first_speed, 0.0, 0.0
     nodes[0, NODE_Y], nodes[0, NODE_ARC_LENGTH] = 0.0, 0.0
@@ -132,10 +130,10 @@ def _fill_rows(
 def point_at(
     reference: LocalReference, arc_length: float, curvature_beyond: float = 0.0
 ) -> LocalPoint:
-    """Point of one reference, fields (K + 1,), at an arc length (m) from its foot point.
+    """Return the point of one reference, fields (K + 1,), at an arc length (m).
 
-    Within an interval the point lies on its arc. Behind the foot point the path is taken to be
-    straight, beyond the preview to go on with `curvature_beyond` (1/m).
+    Within an interval the point lies on its arc. The path is continued straight behind the foot
+    point, and with `curvature_beyond` (1/m) beyond the preview.
     """
     nodes = reference.arc_length
     index = int(np.searchsorted(nodes, arc_length, side="right")) - 1
@@ -158,12 +156,12 @@ def point_at(
 
 
 def mean_curvature(reference: LocalReference, start: float, end: float) -> float:
-    """Heading gained from one arc length (m) to another, per metre, of one reference; 1/m.
+    """Return the mean curvature (1/m) of one reference between two arc lengths (m).
 
-    Where the stretch reaches beyond the preview, the part within the preview stands for all of it.
+    Of a stretch that reaches beyond the preview, the part within the preview is used.
     """
     first, last = float(reference.arc_length[0]), float(reference.arc_length[-1])
-    # At least a centimetre, ending at the preview's end if it must.
+    # At least a centimetre long, even at the end of the preview.
     end = min(max(end, first + 0.01), max(last, first + 0.01))
     start = min(max(start, first), end - 0.01)
     turned = np.interp([start, end], reference.arc_length, reference.heading)
@@ -171,7 +169,9 @@ def mean_curvature(reference: LocalReference, start: float, end: float) -> float
 
 
 def steady_turn(curvature: float, speed: float, vehicle: VehicleParameters) -> Turn:
-    """Steering, sideslip and yaw rate on a circle of the centre of gravity, exact for the bicycle.
+    """Compute steering, sideslip and yaw rate on a circle of the centre of gravity.
+
+    The solution is exact for the bicycle.
 
     With vy' = r' = 0 (`lpv_track_env.bicycle`) the axles share the lateral force m r vx by lr/L and
     lf/L, so that vy = b r with b = lr - m vx^2 lf/(L Car), and the curvature r/sqrt(vx^2 + vy^2)
@@ -185,7 +185,7 @@ def steady_turn(curvature: float, speed: float, vehicle: VehicleParameters) -> T
     Parameters
     ----------
     curvature
-        1/m, signed; limited to what the steering range can hold at standstill.
+        Curvature, 1/m, signed; limited to that at full lock and standstill.
     speed
         vx, m/s.
     vehicle
@@ -197,11 +197,11 @@ def steady_turn(curvature: float, speed: float, vehicle: VehicleParameters) -> T
     curvature = min(max(curvature, -limit), limit)
     momentum = vehicle.mass * speed * speed / wheelbase
     lever = lr - momentum * lf / car
-    # Beyond 60 degrees of sideslip no such circle is worth following.
+    # Limit the sideslip to 60 degrees.
     ratio = min((curvature * lever) ** 2, 0.75)
     turning = curvature / math.sqrt(1.0 - ratio)
     delta = turning * wheelbase
-    for _ in range(3):  # a fixed point that contracts by delta^2 or better
+    for _ in range(3):  # a fixed-point iteration that contracts by delta^2 or better
         cosine = math.cos(min(max(delta, -0.8), 0.8))
         delta = turning * (lever + lf + momentum * lr / (caf * cosine))
     return Turn(
@@ -210,18 +210,18 @@ def steady_turn(curvature: float, speed: float, vehicle: VehicleParameters) -> T
 
 
 def transient_turn(turn: Turn, sideslip: float, speed: float, vehicle: VehicleParameters) -> Turn:
-    """Motion with the centre of gravity on the path while the sideslip still lags behind `turn`.
+    """Compute the motion along the path while the sideslip still lags behind a steady turn's.
 
-    Where the curvature changes, the rear axle swings in behind over about lr metres: with rear slip
-    neglected in the transient, lr beta'/vx + beta = beta_ss, which `lagged_sideslip` integrates.
-    The yaw rate kappa vx - beta' then differs from the steady turn's, and with it the front slip.
+    Where the curvature changes, the rear axle follows over a distance of about lr: with the rear
+    slip neglected in the transient, lr beta'/vx + beta = beta_ss, which `lagged_sideslip`
+    integrates. The yaw rate kappa vx - beta' and the front slip then differ from the steady turn's.
 
     Parameters
     ----------
     turn
-        The steady turn of the curvature here.
+        Steady turn for the present curvature.
     sideslip
-        The nominal sideslip now, rad.
+        Present nominal sideslip, rad.
     speed
         vx, m/s.
     vehicle
@@ -239,29 +239,29 @@ def transient_turn(turn: Turn, sideslip: float, speed: float, vehicle: VehiclePa
 def lagged_sideslip(
     turn: Turn, sideslip: float, distance: float, vehicle: VehicleParameters
 ) -> float:
-    """Nominal sideslip (rad) after another `distance` (m) towards a steady turn."""
+    """Return the nominal sideslip (rad) after another `distance` (m) in a steady turn."""
     share = 1.0 - math.exp(-abs(distance) / vehicle.rear_axle_distance)
     return sideslip + share * (turn.sideslip - sideslip)
 
 
 class EarlyTurn(NamedTuple):
-    """How far a turn that is sharper than a vehicle's should have begun at the foot point."""
+    """Pose and curvature at the foot point of an arc that rounds an undrivable corner."""
 
     lateral_offset: float
-    """m, to the left of the path."""
+    """Position to the left of the path, m."""
     heading: float
-    """rad, relative to the path's."""
+    """Heading relative to the path's, rad."""
     curvature: float
-    """1/m."""
+    """Curvature, 1/m."""
 
 
 def early_turn(reference: LocalReference, limit: float) -> EarlyTurn:
-    """Round a corner ahead that no vehicle can drive, and say what that asks for now.
+    """Round a corner ahead that is too sharp for any vehicle; all zero if there is none to round yet.
 
     A corner of angle theta at the distance w is rounded by an arc of curvature `limit` that starts
-    theta/(2 limit) before it; where the foot point has passed that start, the arc's heading here is
-    H = theta/2 - limit w and its offset H^2/(2 limit). The node ahead with the largest H decides.
-    A path whose curvature stays below 2 `limit` has no such node, so it is left as it is.
+    theta/(2 limit) before it. After that start, the arc's heading at the foot point is
+    H = theta/2 - limit w and its offset H^2/(2 limit). The node ahead with the largest H is used. A
+    path whose curvature stays below 2 `limit` has no such node and is not changed.
     """
     heading = reference.heading - reference.heading[0]
     due = 0.5 * np.abs(heading) - limit * reference.arc_length

@@ -81,7 +81,7 @@ def policy_of(
     ValueError
         If its observation or action space is that of another environment.
     """
-    from agents.learned.sb3_policies import from_sb3
+    from agents.learned.sb3_policies import network_of
 
     size = layout.size
     if np.shape(model.observation_space.low if _box(model.observation_space) else ()) != (size,):
@@ -98,15 +98,18 @@ def policy_of(
             f"in {own}, or [-1, 1] behind RescaleAction: say --vehicle as in its training"
         )
     low, high = own.low.astype(np.float64), own.high.astype(np.float64)
-    return from_sb3(
-        model,
+    network = network_of(model)
+    return Policy(
+        algorithm=algorithm,
         layout=layout,
         control_period=control_period,
-        algorithm=algorithm,
-        feature_weight=np.eye(size),
-        feature_bias=np.zeros(size),
+        feature_weight=np.eye(size, dtype=np.float32),
+        feature_bias=np.zeros(size, dtype=np.float32),
         # Observations saturate at their bounds, so this clips nothing.
         feature_limit=float(layout.bound.max()),
+        layers=network.layers,
+        activation=network.activation,
+        squash=network.squash,
         origin="zero",
         centre=0.5 * (low + high),
         half=0.5 * (high - low),

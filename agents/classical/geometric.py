@@ -1,8 +1,8 @@
-"""Geometric steering: Stanley's front axle and pure pursuit's rear axle.
+"""Geometric steering: Stanley (front axle) and pure pursuit (rear axle).
 
-Both laws were made for an axle on the path. Here the centre of gravity is to be on it, so each axle
-follows the track that it takes while the centre of gravity is on the path (`agents.reference`): a
-constant curve then leaves no error.
+Both laws were designed to keep an axle on the path. Here the centre of gravity shall stay on the
+path, so each axle follows the track that it describes in that case (`agents.reference`); a curve of
+constant curvature then leaves no error.
 """
 
 import math
@@ -24,13 +24,13 @@ from lpv_track_env.observation import TrackingObservation
 
 @dataclass
 class StanleyMemory:
-    """What Stanley remembers of one vehicle."""
+    """Memory of `Stanley` for one vehicle."""
 
     speed: SpeedMemory = field(default_factory=SpeedMemory)
     sideslip: float = 0.0
     """Nominal sideslip, rad."""
     steering_angle: float | None = None
-    """The angle in force one period ago, rad."""
+    """Actual steering angle one period ago, rad."""
 
 
 class Stanley(TrackingAgent[StanleyMemory]):
@@ -45,26 +45,26 @@ class Stanley(TrackingAgent[StanleyMemory]):
     Hoffmann, Tomlin, Montemerlo and Thrun, "Autonomous automobile trajectory tracking for off-road
     driving", American Control Conference 2007. There the front axle is on the path: the path's
     heading below it carries the curvature, and psi_ss, the front tyre's slip in a steady turn, the
-    understeer. Here both are in delta_n, the steering with the centre of gravity on the path;
-    beta_n and r_n are the sideslip and yaw rate that go with it, e_f is the front axle's distance
-    from its own track. A corner that no vehicle can drive is begun early (`early_turn`).
+    understeer. Here delta_n, the steering with the centre of gravity on the path, contains both;
+    beta_n and r_n are the corresponding sideslip and yaw rate, e_f is the front axle's distance
+    from its own track. A corner too sharp for any vehicle is begun early (`early_turn`).
 
     Parameters
     ----------
     task
-        What will be driven.
+        Task to drive.
     gain
         k, 1/s.
     softening_speed
-        k_soft, m/s: bounds the reaction to lateral errors at low speed.
+        k_soft, m/s; limits the reaction to lateral errors at low speed.
     yaw_damping
         k_yaw, s.
     steering_damping
-        k_steer, 1, below 1: on the steering angle's last change.
+        k_steer, dimensionless, below 1; acts on the last change of the steering angle.
     curvature_window
-        m ahead of the foot point over which the curvature is averaged.
+        Distance ahead of the foot point over which the curvature is averaged, m.
     early_turn_share
-        Share of the curvature at full lock with which undrivable corners are rounded.
+        Curvature with which undrivable corners are rounded, as a share of that at full lock.
     """
 
     def __init__(
@@ -88,13 +88,13 @@ class Stanley(TrackingAgent[StanleyMemory]):
         self.speed_control = SpeedControl(task)
 
     def new_memory(self) -> StanleyMemory:
-        """Memory of a vehicle that begins without sideslip."""
+        """Return the memory of a vehicle that begins without sideslip."""
         return StanleyMemory()
 
     def control(
         self, observation: TrackingObservation, memory: StanleyMemory
     ) -> tuple[float, float]:
-        """Acceleration (m/s^2) and steering angle (rad) for one observation."""
+        """Return acceleration (m/s^2) and steering angle (rad) for one observation."""
         vehicle, period = self.task.vehicle, self.task.control_period
         reference = local_reference(observation, self.task.layout.preview_period)
         vx, in_force = float(observation.longitudinal_speed), float(observation.steering_angle)
@@ -132,24 +132,23 @@ class PurePursuit(TrackingAgent[SpeedMemory]):
 
         delta = (L + K vx^2) 2 sin(alpha) / d
 
-    with d the distance of the goal from the rear axle and alpha its bearing from the direction in
-    which this axle travels: the arc's curvature (Coulter, CMU-RI-TR-92-01, 1992), times what the
-    bicycle needs per curvature, L without slip and the understeer gradient K times vx^2 with it.
-    The goal lies where the rear axle will be when the centre of gravity is on the path, a lookahead
-    farther on: lr behind the path's point, turned by the sideslip there. The direction of travel is
-    the heading and the steady turn's slip at the rear axle, zero at low speed.
+    with d the distance of the goal from the rear axle and alpha its bearing from the rear axle's
+    direction of travel. This is the curvature of the arc (Coulter, CMU-RI-TR-92-01, 1992) times the
+    bicycle's steering angle per curvature: L without slip, plus the understeer gradient K times
+    vx^2. The goal is where the rear axle will be when the centre of gravity is on the path, one
+    lookahead farther on: lr behind that point of the path, turned by the sideslip there. The
+    direction of travel is the heading plus the rear axle's slip in a steady turn.
 
     Parameters
     ----------
     task
-        What will be driven.
+        Task to drive.
     lookahead_time
-        s.
+        Lookahead along the path, in s of driving at the current speed.
     lookahead_wheelbases
-        The least lookahead, in wheelbases: the lookahead distance along the path is the larger one
-        of this and lookahead_time |vx|.
+        Smallest lookahead along the path, in wheelbases.
     curvature_window
-        m ahead of the foot point over which the curvature for the rear slip is averaged.
+        Distance ahead of the foot point over which the curvature for the rear slip is averaged, m.
     """
 
     def __init__(
@@ -167,23 +166,23 @@ class PurePursuit(TrackingAgent[SpeedMemory]):
         self.speed_control = SpeedControl(task)
 
     def new_memory(self) -> SpeedMemory:
-        """Memory of the speed control: the steering remembers nothing."""
+        """Return the memory of the speed control; the steering has none."""
         return SpeedMemory()
 
     def control(self, observation: TrackingObservation, memory: SpeedMemory) -> tuple[float, float]:
-        """Acceleration (m/s^2) and steering angle (rad) for one observation."""
+        """Return acceleration (m/s^2) and steering angle (rad) for one observation."""
         vehicle = self.task.vehicle
         reference = local_reference(observation, self.task.layout.preview_period)
         vx, heading_error = float(observation.longitudinal_speed), float(observation.heading_error)
         lr = vehicle.rear_axle_distance
         lookahead = max(self.minimum_lookahead, self.lookahead_time * abs(vx))
 
-        # The path goes on beyond the preview as in its last metres, as far as it could be driven.
+        # Beyond the preview, continue with the curvature of its last metres, as far as drivable.
         end = float(reference.arc_length[-1])
         limit = vehicle.max_steering_angle / vehicle.wheelbase
         beyond = min(max(mean_curvature(reference, end - 2.0 * lr, end), -limit), limit)
         point = point_at(reference, lookahead, beyond)
-        # The rear axle swings in over about lr, so the curvature before the goal decides.
+        # The rear axle follows within about lr, so use the curvature just before the goal.
         before = mean_curvature(reference, lookahead - 2.0 * lr, lookahead)
         goal_heading = point.heading - steady_turn(before, vx, vehicle).sideslip
 
@@ -191,9 +190,9 @@ class PurePursuit(TrackingAgent[SpeedMemory]):
         goal_y = point.y - lr * math.sin(goal_heading)
         ahead = goal_x + lr * math.cos(heading_error)
         left = goal_y - (float(observation.lateral_error) - lr * math.sin(heading_error))
-        # A goal nearer than half the lookahead is one that the vehicle is not driving towards.
+        # A goal nearer than half the lookahead is not ahead of the vehicle.
         distance = max(math.hypot(ahead, left), 0.5 * lookahead)
-        # With slip, the rear axle travels beside the vehicle's heading.
+        # With slip, the rear axle does not travel in the direction of the heading.
         here = steady_turn(mean_curvature(reference, 0.0, self.curvature_window), vx, vehicle)
         travel = heading_error + here.rear_slip
         across = left * math.cos(travel) - ahead * math.sin(travel)  # d sin(alpha)

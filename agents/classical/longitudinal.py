@@ -1,4 +1,4 @@
-"""Speed control, shared by the classical agents: they differ in how they steer."""
+"""Speed control of all classical agents; they differ in steering only."""
 
 from dataclasses import dataclass
 
@@ -12,26 +12,26 @@ from lpv_track_env.observation import TrackingObservation
 
 @dataclass
 class SpeedMemory:
-    """What speed control remembers of one vehicle."""
+    """Memory of the speed control for one vehicle."""
 
     integral: float = 0.0
     """Integral part of the demanded acceleration, m/s^2."""
 
 
 class SpeedControl:
-    """Follow the reference speed: preview feedforward, model inversion and a PI controller.
+    """Tracking of the reference speed: preview feedforward, model inversion and a PI controller.
 
-    The demanded vx' is the reference's own acceleration over the control period plus kp e + ki
-    int e, e = reference speed - vx, kept in the vehicle's range. The command a is what makes the
-    bicycle's longitudinal equation give that demand: rolling resistance, the front tyre's drag and
-    r vy are taken from `bicycle.derivative`, so they are compensated at every speed.
+    The demanded vx' is the reference's acceleration over the control period plus kp e + ki int e
+    with e = reference speed - vx, limited to the vehicle's range. The command a is found by
+    inverting the bicycle's longitudinal equation: rolling resistance, the front tyre's drag and
+    r vy come from `bicycle.derivative`, so they are compensated at every speed.
 
     Parameters
     ----------
     task
-        The vehicle and its control period.
+        Vehicle and control period.
     proportional_gain
-        kp, 1/s: a speed error decays with this rate.
+        kp, 1/s; decay rate of a speed error.
     integral_gain
         ki, 1/s^2; kp^2/4 is critically damped.
     """
@@ -52,18 +52,18 @@ class SpeedControl:
         steering_angle: float,
         memory: SpeedMemory,
     ) -> float:
-        """Acceleration command, m/s^2.
+        """Return the acceleration command, m/s^2.
 
         Parameters
         ----------
         observation
-            Of one vehicle.
+            Observation of one vehicle.
         reference
-            The same observation's `local_reference`, fields (K + 1,).
+            Its `local_reference`, fields (K + 1,).
         steering_angle
-            The steering angle that will be commanded with it, rad.
+            Steering angle of the same command, rad.
         memory
-            Of this vehicle; its integral is updated.
+            Memory of this vehicle; the integral is updated.
         """
         vehicle, period = self.vehicle, self.control_period
         vx, in_force = float(observation.longitudinal_speed), float(observation.acceleration)
@@ -85,11 +85,11 @@ class SpeedControl:
         wanted = feedforward + self.proportional_gain * error + memory.integral
         demand = min(max(wanted, lowest), highest)
         command = demand - coasting
-        # What the actuator will do: its range and its rate.
+        # The actuator limits the command's range and rate.
         low, high = vehicle.acceleration_range
         change = vehicle.max_jerk * period
         actual = min(max(min(max(command, low), high), in_force - change), in_force + change)
-        # Anti-windup by conditional integration: not further into a limit.
+        # Anti-windup by conditional integration: never further into a limit.
         excess = wanted - (actual + coasting)
         if excess * error <= 0.0 or abs(excess) < 1e-3:
             memory.integral += self.integral_gain * error * period

@@ -24,15 +24,15 @@ class LateralModel(NamedTuple):
     """Lateral error dynamics over one control period: z+ = A z + B u + D kappa."""
 
     A: Array
-    """(5, 5), of z = [e_y, vy, e_psi, r, delta]: m, m/s, rad, rad/s, rad."""
+    """(5, 5); z = [e_y, vy, e_psi, r, delta] in m, m/s, rad, rad/s, rad."""
     B: Array
-    """(5, 1), of u, the change of the steering angle at the period's start, rad."""
+    """(5, 1); u is the change of the steering angle at the start of the period, rad."""
     D: Array
-    """(5,), of the path's mean curvature over the period, 1/m."""
+    """(5,); kappa is the path's mean curvature over the period, 1/m."""
 
 
 def lateral_model(speed: float, period: float, vehicle: VehicleParameters) -> LateralModel:
-    """Discretise the lateral error dynamics exactly, inputs held over the period.
+    """Discretise the lateral error dynamics exactly, with inputs held over the period.
 
     (vy, r) and the steering come from `lpv.matrices` at [vx, 0, 0, 0, 0, 0], delta = 0; the errors
     follow e_y' = vy + vx e_psi and e_psi' = r - vx kappa (Rajamani, Vehicle Dynamics and Control,
@@ -51,37 +51,37 @@ def lateral_model(speed: float, period: float, vehicle: VehicleParameters) -> La
         continuous[row, 4] = b_matrix[source, 1]
     held = expm(continuous * period)
     A = held[:STATES, :STATES]
-    # The steering angle changes at once and is then held: u enters as delta does.
+    # The steering angle changes at once and is then held, so u enters like delta.
     return LateralModel(A, A[:, 4:5], held[:STATES, STATES])
 
 
 class Gains(NamedTuple):
-    """u = -feedback z - preview kappa, for one speed."""
+    """Gains for one speed: u = -feedback z - preview kappa."""
 
     feedback: Array
     """(5,)."""
     preview: Array
-    """(n + 1,): of the mean curvature over each of the next n control periods, and of the curvature
-    that goes on for ever after them."""
+    """(n + 1,): for the mean curvature over each of the next n control periods, and for the constant
+    curvature after them."""
 
 
 def preview_gains(model: LateralModel, cost: Array, effort: float, count: int) -> Gains:
-    """Minimise sum z' cost z + effort u^2 with the path's curvature known ahead.
+    """Compute the gains that minimise sum z' cost z + effort u^2 with the curvature known ahead.
 
-    The linear-quadratic problem with preview (Tomizuka 1975; Peng and Tomizuka, Journal of Dynamic
-    Systems, Measurement, and Control, 1993): with P of the Riccati equation and Acl = A - B K, the
-    curvature i periods ahead enters u through (effort + B'PB)^-1 B' (Acl')^i P D.
+    This is the linear-quadratic problem with preview (Tomizuka 1975; Peng and Tomizuka, Journal of
+    Dynamic Systems, Measurement, and Control, 1993). With P the solution of the Riccati equation and
+    Acl = A - B K, the curvature i periods ahead has the gain (effort + B'PB)^-1 B' (Acl')^i P D.
 
     Parameters
     ----------
     model
-        The lateral error dynamics.
+        Lateral error dynamics.
     cost
         (5, 5), positive semidefinite.
     effort
-        Positive.
+        Positive weight of u^2.
     count
-        n, periods of preview; the curvature is taken to go on after them as in `Gains.preview`.
+        n, number of periods of preview; the curvature is constant after them.
     """
     A, B, D = model
     P = solve_discrete_are(A, B, cost, np.array([[effort]]))
@@ -93,7 +93,7 @@ def preview_gains(model: LateralModel, cost: Array, effort: float, count: int) -
     for k in range(count):
         preview[k] = scaled_input @ effect
         effect = closed.T @ effect
-    # The geometric series of all that follow.
+    # Geometric series over all later periods.
     preview[count] = scaled_input @ np.linalg.solve(np.eye(STATES) - closed.T, effect)
     return Gains(feedback, preview)
 
@@ -101,22 +101,21 @@ def preview_gains(model: LateralModel, cost: Array, effort: float, count: int) -
 class LpvLqr(TrackingAgent[SpeedMemory]):
     """Linear-quadratic steering with preview, its gains scheduled over the speed.
 
-    At every speed of a grid it minimises, over an infinite horizon and with the curvature ahead
-    known,
+    For every speed of a grid the gains minimise, over an infinite horizon with known curvature,
 
         sum_k  T (q_y e_y^2 + q_v (vy + vx e_psi)^2) + R/T u_k^2
 
-    with u the change of the steering angle in one control period T, so that R weighs the steering
+    with u the change of the steering angle in one control period T, so that R weights the steering
     rate and the gains hardly depend on T. On a circle all three terms vanish: the steering angle,
-    sideslip and heading error of a steady turn cost nothing, and so a constant curve leaves no
-    error. The model is linear in the steering angle; the difference to the bicycle's own steady
-    turn (`agents.reference.steady_turn`) is taken off the state. Between speeds, gains are
-    interpolated; the grid leaves out standstill, where lateral errors cannot be controlled.
+    sideslip and heading error of a steady turn cost nothing, so a constant curvature leaves no
+    error. The model is linear in the steering angle; its difference from the bicycle's steady turn
+    (`agents.reference.steady_turn`) is subtracted from the state. Gains are interpolated between
+    speeds. The grid omits standstill, where lateral errors cannot be controlled.
 
     Parameters
     ----------
     task
-        What will be driven.
+        Task to drive.
     lateral_error_weight
         q_y, 1/m^2.
     lateral_rate_weight
@@ -124,11 +123,11 @@ class LpvLqr(TrackingAgent[SpeedMemory]):
     steering_rate_weight
         R, s^2/rad^2.
     approach_angle
-        rad: e_y is limited so that it asks for no heading error beyond this angle.
+        Largest heading error to which e_y may lead, rad.
     speed_step
-        m/s, of the grid: up to the vehicle's highest speed, down to 5 m/s in reverse.
+        Step of the speed grid, m/s; it reaches from 5 m/s in reverse to the vehicle's top speed.
     curvature_window
-        m ahead of the foot point over which the steady turn's curvature is averaged.
+        Distance ahead of the foot point over which the steady turn's curvature is averaged, m.
     """
 
     def __init__(
@@ -151,7 +150,7 @@ class LpvLqr(TrackingAgent[SpeedMemory]):
         self.count = max(round(layout.preview_steps * layout.preview_period / period), 1)
         forward = speed_step * np.arange(1, round(task.vehicle.speed_range[1] / speed_step) + 1)
         self.speeds = np.concatenate([-forward[forward <= 5.0][::-1], forward])
-        """(m,) m/s, the grid."""
+        """Speed grid, (m,) m/s."""
         rows = []
         for speed in self.speeds:
             lateral_rate = np.array([0.0, 1.0, speed, 0.0, 0.0])
@@ -161,14 +160,14 @@ class LpvLqr(TrackingAgent[SpeedMemory]):
             gains = preview_gains(model, period * cost, steering_rate_weight / period, self.count)
             rows.append(np.concatenate(gains))
         self.table = np.array(rows)
-        """(m, 5 + n + 1), gains at the grid's speeds."""
+        """Gains at the speeds of the grid, (m, 5 + n + 1)."""
 
     def new_memory(self) -> SpeedMemory:
-        """Memory of the speed control: the steering remembers nothing."""
+        """Return the memory of the speed control; the steering has none."""
         return SpeedMemory()
 
     def gains(self, speed: float) -> Gains:
-        """Gains at a speed (m/s), interpolated; beyond the grid those of its ends."""
+        """Interpolate the gains at a speed (m/s); beyond the grid, take those at its ends."""
         grid = self.speeds
         speed = min(max(speed, float(grid[0])), float(grid[-1]))
         k = min(max(int(np.searchsorted(grid, speed)), 1), len(grid) - 1)
@@ -177,10 +176,10 @@ class LpvLqr(TrackingAgent[SpeedMemory]):
         return Gains(row[:STATES], row[STATES:])
 
     def control(self, observation: TrackingObservation, memory: SpeedMemory) -> tuple[float, float]:
-        """Acceleration (m/s^2) and steering angle (rad) for one observation."""
+        """Return acceleration (m/s^2) and steering angle (rad) for one observation."""
         reference = local_reference(observation, self.task.layout.preview_period)
         vx, in_force = float(observation.longitudinal_speed), float(observation.steering_angle)
-        # Mean curvature over the stretches that the vehicle will drive in the next periods.
+        # Mean curvature over the stretch of path driven in each of the next periods.
         stretch = max(vx, self.slowest) * self.task.control_period
         places = stretch * np.arange(self.count + 1)
         curvature = np.diff(np.interp(places, reference.arc_length, reference.heading)) / stretch
@@ -205,12 +204,12 @@ class LpvLqr(TrackingAgent[SpeedMemory]):
         return acceleration, steering
 
     def _nonlinearity(self, curvature: float, speed: float) -> Array:
-        """Steady state z (5,) on a circle: the bicycle's minus the linear model's."""
+        """Return the steady state z (5,) on a circle, the bicycle's minus the linear model's."""
         vehicle = self.task.vehicle
         limit = vehicle.max_steering_angle / vehicle.wheelbase
         curvature = min(max(curvature, -limit), limit)
         turn = steady_turn(curvature, speed, vehicle)
-        # The linear model's: steady_turn to first order in the curvature.
+        # Linear model: steady_turn to first order in the curvature.
         share = vehicle.front_axle_distance / (vehicle.wheelbase * vehicle.rear_cornering_stiffness)
         sideslip = curvature * (vehicle.rear_axle_distance - vehicle.mass * speed**2 * share)
         per_curvature = vehicle.wheelbase + vehicle.understeer_gradient * speed**2

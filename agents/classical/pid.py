@@ -18,40 +18,40 @@ from lpv_track_env.observation import TrackingObservation
 
 @dataclass
 class PidMemory:
-    """What the PID remembers of one vehicle."""
+    """Memory of `Pid` for one vehicle."""
 
     speed: SpeedMemory = field(default_factory=SpeedMemory)
     sideslip: float = 0.0
     """Nominal sideslip, rad."""
     integral: float = 0.0
-    """m: the integral part, in units of the error."""
+    """Integral part, m (the unit of the error)."""
     error: float | None = None
-    """m, of one period ago."""
+    """Error one period ago, m."""
     error_rate: float = 0.0
-    """m/s, low-pass filtered."""
+    """Low-pass filtered rate of the error, m/s."""
 
 
 class Pid(TrackingAgent[PidMemory]):
-    """PID steering, scheduled on the vehicle and its speed.
+    """PID steering with gains scheduled on the vehicle and its speed.
 
     ::
 
         e     = e_y + l sin(e_psi + beta_n),    l = lookahead_wheelbases L + lookahead_time |vx|
         delta = delta_n - (L + K vx^2) (2 zeta/l)^2 (e + int e dt / T_i + T_d e')
 
-    e is the lateral error at a point l ahead of the centre of gravity, for a vehicle on the path
-    zero also in a curve; delta_n and beta_n are the steering and sideslip that keep the centre of
-    gravity on the path (`agents.reference.transient_turn`). (L + K vx^2) is the steering per
-    curvature, so over the distance driven e_y'' + (2 zeta/l)^2 (e_y + l e_y') = 0: critically
-    damped at zeta 1, at every speed and for every vehicle. The integral holds still while the
-    steering is at its range or rate limit and would be driven further into it.
+    e is the lateral error at a point l ahead of the centre of gravity; it is zero for a vehicle on
+    the path, in curves as well. delta_n and beta_n are the steering and sideslip that keep the
+    centre of gravity on the path (`agents.reference.transient_turn`). (L + K vx^2) is the steering
+    angle per curvature, so over the distance driven e_y'' + (2 zeta/l)^2 (e_y + l e_y') = 0, which
+    is critically damped for zeta = 1 at every speed and for every vehicle. The integral is held
+    while the steering is at a range or rate limit and the error would drive it further.
 
     Parameters
     ----------
     task
-        What will be driven.
+        Task to drive.
     lookahead_time
-        s.
+        Increase of the lookahead l with speed, s.
     lookahead_wheelbases
         Lookahead at standstill, in wheelbases.
     damping
@@ -59,14 +59,14 @@ class Pid(TrackingAgent[PidMemory]):
     integral_time, derivative_time
         T_i and T_d, s.
     filter_time
-        s, of the derivative's low-pass filter.
+        Time constant of the derivative's low-pass filter, s.
     approach_angle
-        rad: e_y is limited to approach_angle l, so from far away the vehicle heads for the path at
-        this angle and no steeper.
+        Largest angle at which the vehicle approaches the path from far away, rad: e_y is limited to
+        approach_angle l.
     curvature_window
-        m ahead of the foot point over which the curvature is averaged.
+        Distance ahead of the foot point over which the curvature is averaged, m.
     early_turn_share
-        Share of the curvature at full lock with which undrivable corners are rounded.
+        Curvature with which undrivable corners are rounded, as a share of that at full lock.
     """
 
     def __init__(
@@ -96,11 +96,11 @@ class Pid(TrackingAgent[PidMemory]):
         self.speed_control = SpeedControl(task)
 
     def new_memory(self) -> PidMemory:
-        """Memory of a vehicle that begins without sideslip, its integrators empty."""
+        """Return the memory of a vehicle without sideslip, its integrators empty."""
         return PidMemory()
 
     def control(self, observation: TrackingObservation, memory: PidMemory) -> tuple[float, float]:
-        """Acceleration (m/s^2) and steering angle (rad) for one observation."""
+        """Return acceleration (m/s^2) and steering angle (rad) for one observation."""
         vehicle, period = self.task.vehicle, self.task.control_period
         reference = local_reference(observation, self.task.layout.preview_period)
         vx = float(observation.longitudinal_speed)
@@ -137,11 +137,11 @@ class Pid(TrackingAgent[PidMemory]):
     def _integrate(
         self, observation: TrackingObservation, steering: float, error: float, memory: PidMemory
     ) -> None:
-        """Integrate the error, unless the steering is limited and the error would push it on."""
+        """Integrate the error, unless it would drive the steering further into a limit."""
         vehicle, period = self.task.vehicle, self.task.control_period
         in_force, reach = float(observation.steering_angle), vehicle.max_steering_rate * period
         actual = min(max(steering, in_force - reach), in_force + reach)
         actual = min(max(actual, -vehicle.max_steering_angle), vehicle.max_steering_angle)
-        # A positive error steers to negative angles.
+        # A positive error leads to a negative angle.
         if (actual - steering) * error <= 0.0:
             memory.integral += error * period / self.integral_time

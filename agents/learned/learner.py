@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from agents.base import DrivingTask
 from agents.delay import DelayMemory, NearFuture
 from agents.learned.policy import ORIGINS, Origin, Policy
-from agents.learned.sb3_policies import from_sb3
+from agents.learned.sb3_policies import network_of
 from agents.sb3 import AdapterVecEnv, TrackingVecEnv
 from lpv_track_env.observation import ACCELERATION, PREVIEW_BOUNDS, SCALARS, STEERING_ANGLE
 from lpv_track_env.vehicle import VehicleParameters
@@ -290,9 +290,10 @@ class LearnerVecEnv(AdapterVecEnv):
         ValueError
             For another kind of policy.
         """
-        return from_sb3(
-            model, layout=self.task.layout, control_period=self.task.control_period,
-            algorithm=algorithm, training=training or {}, symmetric=True, **vars(self.scaling),
+        return Policy(
+            **network_of(model)._asdict(), **vars(self.scaling), algorithm=algorithm,
+            layout=self.task.layout, control_period=self.task.control_period,
+            training=training or {}, symmetric=True,
         )  # fmt: skip
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:

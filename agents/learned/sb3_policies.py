@@ -1,88 +1,63 @@
-"""Policies out of models of Stable-Baselines3: PPO, SAC and TD3 with an MLP on flat observations.
+"""Networks of SB3's PPO, SAC and TD3 models with an MLP on flat observations, as `Policy` has them.
 
-The only file of this package that imports torch and SB3, on use.
+torch and SB3 are imported when they are needed.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from agents.learned.files import Layer
-from agents.learned.policy import Activation, Origin, Policy, Squash
-from lpv_track_env.observation import ObservationLayout
+from agents.learned.policy import Activation, Squash
 from trajectories.naming import choose
 
 ALGORITHMS = ("ppo", "sac", "td3")
 ACTIVATIONS: dict[str, Activation] = {"Tanh": "tanh", "ReLU": "relu"}
-"""Of torch's classes."""
+"""Names of torch's classes -> names of activations."""
 
 
-def from_sb3(
-    model: Any,
-    *,
-    layout: ObservationLayout,
-    control_period: float,
-    algorithm: str,
-    feature_weight: ArrayLike,
-    feature_bias: ArrayLike,
-    feature_limit: float,
-    origin: Origin,
-    centre: ArrayLike,
-    half: ArrayLike,
-    training: Mapping[str, Any],
-    symmetric: bool = False,
-) -> Policy:
-    """Take the deterministic policy out of a model of SB3.
+class Sb3Network(NamedTuple):
+    """Network from features to u in [-1, 1]; the fields of `Policy` with these names."""
 
-    The model maps features to its own action space; that space's range, whatever it is, becomes
-    u in [-1, 1], so `centre` and `half` say what the ends of that range mean in SI units.
+    layers: tuple[Layer, ...]
+    activation: Activation
+    squash: Squash
+
+
+def network_of(model: Any) -> Sb3Network:
+    """Extract the network of a model's deterministic policy.
+
+    The model maps features to its own action space. The range of that space becomes u in [-1, 1],
+    so `Policy.centre` and `Policy.half` give the ends of that range in SI units.
 
     Parameters
     ----------
     model
         PPO, SAC or TD3 (or another algorithm with the same policy class), "MlpPolicy".
-    layout, control_period, algorithm, feature_weight, feature_bias, feature_limit, origin, centre, half, training, symmetric
-        Of the `Policy`; the features are what the model was shown, worked out outside of it.
 
     Raises
     ------
     ValueError
-        For a policy that is not such a network, with the reason; or see `Policy`.
-    """  # noqa: E501
-    modules, squash = _network(model.policy)
+        For a policy that is not such a network, with the reason.
+    """
+    modules, squash = _modules(model.policy)
     layers, activation = _layers(modules)
     low, high = _range(model.action_space)
     if squash == "clip":
-        # Such a model is trained on the action itself, which is clipped to the space outside.
+        # PPO is trained on the action itself, which is clipped to the space afterwards.
         middle, reach = 0.5 * (low + high), 0.5 * (high - low)
         weight, bias = layers[-1]
         layers[-1] = (
             (weight / reach[:, None]).astype(np.float32),
             ((bias - middle) / reach).astype(np.float32),
         )
-    return Policy(
-        algorithm=algorithm,
-        layout=layout,
-        control_period=control_period,
-        feature_weight=feature_weight,  # type: ignore[arg-type]
-        feature_bias=feature_bias,  # type: ignore[arg-type]
-        feature_limit=feature_limit,
-        layers=tuple(layers),
-        activation=activation,
-        squash=squash,
-        origin=origin,
-        centre=centre,  # type: ignore[arg-type]
-        half=half,  # type: ignore[arg-type]
-        training=training,
-        symmetric=symmetric,
-    )
+    return Sb3Network(tuple(layers), activation, squash)
 
 
 def load_trusted(file: Path, algorithm: str) -> Any:
-    """Load a .zip of SB3, on the CPU. This runs whatever code the file holds.
+    """Load an SB3 model, on the CPU. This runs whatever code the file contains.
 
     Raises
     ------
@@ -105,15 +80,15 @@ def load_trusted(file: Path, algorithm: str) -> Any:
     kind = getattr(stable_baselines3, algorithm.upper())
     try:
         return kind.load(file, device="cpu")
-    except Exception as error:  # what a file may raise that is something else, nobody knows
+    except Exception as error:  # a file that is something else may raise anything
         raise ValueError(
             f"{file} is not a model that {algorithm.upper()} of Stable-Baselines3 loads: "
             f"{type(error).__name__}: {error}"
         ) from error
 
 
-def _network(policy: Any) -> tuple[list[Any], Squash]:
-    """Modules from features to the deterministic action, in order, and what follows them."""
+def _modules(policy: Any) -> tuple[list[Any], Squash]:
+    """Return the modules from features to the mean action, and the squashing after them."""
     from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.common.torch_layers import FlattenExtractor
     from stable_baselines3.sac.policies import SACPolicy
@@ -142,14 +117,14 @@ def _network(policy: Any) -> tuple[list[Any], Squash]:
 
 
 def _layers(modules: list[Any]) -> tuple[list[Layer], Activation]:
-    """Weights and biases of linear modules with one activation between them."""
+    """Return weights and biases of linear modules, and the one activation between them."""
     from torch import nn
 
     linear, between = modules[::2], modules[1::2]
     kinds = {type(module).__name__ for module in between}
     if not all(type(module) is nn.Linear for module in linear) or not kinds <= ACTIVATIONS.keys():
-        told = ", ".join(type(module).__name__ for module in modules)
-        raise ValueError(f"{told} cannot be taken: only linear layers with Tanh or ReLU between")
+        given = ", ".join(type(module).__name__ for module in modules)
+        raise ValueError(f"{given} cannot be taken: only linear layers with Tanh or ReLU between")
     if len(kinds) > 1:
         raise ValueError("layers with different activations cannot be taken")
     layers: list[Layer] = [

@@ -11,8 +11,8 @@ It is computed from the true motion of the vehicle, not from measurements or com
 leaves the road, turns around or breaks down scores `FAILED`. The scales were chosen before anything
 was tuned. Lateral error: 3.5 cm of error in the fixes with 3.5 cm of control error; heading error:
 the sideslip lr kappa of the default vehicle in a bend of 17 m, which no weights can avoid; speed
-error: the effect of the jerk limit at a start; steering rate and jerk: two fifths and four fifths of
-their limits.
+error: the effect of the jerk limit at a start; steering rate: two fifths of its limit; jerk: four
+fifths of its limit.
 """
 
 from typing import Any

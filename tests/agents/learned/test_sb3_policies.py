@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import agents
-from agents.learned import read
+from agents.learned import Policy, read
 from experiments.cli import main
 from lpv_track_env import PATH_TRACKING
 from lpv_track_env.observation import ObservationLayout
@@ -59,15 +59,15 @@ SI = gymnasium.spaces.Box(np.float32([-5.0, -0.5]), np.float32([3.5, 0.5]), dtyp
 def test_a_policy_is_its_sb3_model(
     algorithm: str, activation: str, actions: gymnasium.spaces.Box
 ) -> None:
-    from agents.learned.sb3_policies import from_sb3
+    from agents.learned.sb3_policies import network_of
 
     rng = np.random.default_rng(0)
     weight, bias = rng.normal(size=(9, 48)) / 5.0, rng.normal(size=9)
     model = sb3_model(algorithm, activation, 9, actions)
-    policy = from_sb3(
-        model, layout=ObservationLayout(), control_period=0.05, algorithm=algorithm,
-        feature_weight=weight, feature_bias=bias, feature_limit=2.0, origin="zero",
-        centre=np.zeros(2), half=np.ones(2), training={},
+    policy = Policy(
+        **network_of(model)._asdict(), layout=ObservationLayout(), control_period=0.05,
+        algorithm=algorithm, feature_weight=weight, feature_bias=bias, feature_limit=2.0,
+        origin="zero", centre=np.zeros(2), half=np.ones(2),
     )  # fmt: skip
     rows = observations(200)
     features = np.clip(
@@ -86,15 +86,11 @@ def test_what_sb3_has_besides_is_refused() -> None:
     stable_baselines3 = pytest.importorskip("stable_baselines3")
     import torch
 
-    from agents.learned.sb3_policies import from_sb3
+    from agents.learned.sb3_policies import network_of
 
     def refused(model: Any) -> str:
         with pytest.raises(ValueError, match="cannot be taken") as raised:
-            from_sb3(
-                model, layout=ObservationLayout(), control_period=0.05, algorithm="x",
-                feature_weight=np.ones((9, 48)), feature_bias=np.zeros(9), feature_limit=1.0,
-                origin="zero", centre=[0.0, 0.0], half=[1.0, 1.0], training={},
-            )  # fmt: skip
+            network_of(model)
         assert "\n" not in str(raised.value)
         return str(raised.value)
 
