@@ -67,8 +67,8 @@ def local_reference(observation: TrackingObservation, period: float) -> LocalRef
     """Reconstruct the nodes of the reference from the preview of an observation.
 
     Each interval has constant acceleration, so its length is the mean of its end speeds times the
-    period; and constant curvature, so it is an arc whose chord has the length length * sinc(turn / 2)
-    and the interval's mean heading. The result is exact for a path of such intervals.
+    period; and constant curvature, so it is an arc: the chord is length * sinc(turn / 2) long and
+    has the interval's mean heading. The result is exact for a path of such intervals.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ class EarlyTurn(NamedTuple):
 
 
 def early_turn(reference: LocalReference, limit: float) -> EarlyTurn:
-    """Round a corner ahead that is too sharp for any vehicle; all zero if there is none to round yet.
+    """Round a corner ahead that is too sharp for any vehicle; zeros if none is near.
 
     A corner of angle theta at the distance w is rounded by an arc of curvature `limit` that starts
     theta/(2 limit) before it. After that start, the arc's heading at the foot point is

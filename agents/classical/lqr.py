@@ -59,17 +59,17 @@ class Gains(NamedTuple):
     """Gains for one speed: u = -feedback z - preview kappa."""
 
     feedback: Array
-    """(5,)."""
+    """(5,), for the state z."""
     preview: Array
-    """(n + 1,): for the mean curvature over each of the next n control periods, and for the constant
-    curvature after them."""
+    """(n + 1,), for the mean curvature over each of the next n control periods, and for the
+    constant curvature after them."""
 
 
 def preview_gains(model: LateralModel, cost: Array, effort: float, count: int) -> Gains:
     """Compute the gains that minimise sum z' cost z + effort u^2 with the curvature known ahead.
 
     This is the linear-quadratic problem with preview (Tomizuka 1975; Peng and Tomizuka, Journal of
-    Dynamic Systems, Measurement, and Control, 1993). With P the solution of the Riccati equation and
+    Dynamic Systems, Measurement, and Control, 1993). With P from the Riccati equation and
     Acl = A - B K, the curvature i periods ahead has the gain (effort + B'PB)^-1 B' (Acl')^i P D.
 
     Parameters
