@@ -1,13 +1,25 @@
 """`lpv-track switching`: whether switching the NMPC's weights loses vehicles."""
 
 import argparse
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from rich import box
 from rich.console import Console
+from rich.table import Table
 
 from experiments.commands.options import add_out, add_seed, add_vehicle, resumable
 
+if TYPE_CHECKING:
+    from agents.weights import TrackingWeights
+
 EXAMPLE = "lpv-track switching --episodes 2000 --spans 10 100 whole --out results/switching"
+MOST_SPAN = 1e4
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -38,9 +50,165 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_out(parser, "results/switching")
 
 
-def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command and return its exit code."""
-    from experiments.robustness.command import run_switching
+def spans_of(given: list[str]) -> tuple[float, ...]:
+    """Convert spans to numbers; "whole" stands for the whole bounds of weights.
 
-    with resumable(options, console):
-        return run_switching(options, console)
+    Raises
+    ------
+    ValueError
+        For anything else than a number above 1 and at most 10000.
+    """
+    from experiments.robustness.switching import WHOLE
+
+    spans = []
+    for text in given:
+        try:
+            span = WHOLE if text == "whole" else float(text)
+        except ValueError:
+            span = 0.0
+        if span != WHOLE and not 1.0 < span <= MOST_SPAN:
+            raise ValueError(
+                f"--spans are numbers above 1 and at most {MOST_SPAN:g}, or whole; not {text}"
+            )
+        spans.append(span)
+    return tuple(dict.fromkeys(spans))
+
+
+def base_of(file: Path | None) -> "TrackingWeights":
+    """Return the single set of a schedule's file, or the default set without a file.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be read, or holds a policy or several sets.
+    """
+    from agents.weight_tuning.policy import load
+    from agents.weights import TrackingWeights, WeightSchedule
+
+    if file is None:
+        return TrackingWeights()
+    result = load(file)
+    if not isinstance(result, WeightSchedule) or len(set(result.weights)) != 1:
+        raise ValueError(f"{file} holds no single set of weights to switch around")
+    return result.weights[0]
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the command and return its exit code.
+
+    It drives every arm, prints the table and writes `switching.json`; arms in it are kept.
+    """
+    from agents.weights import HIGHEST, LOWEST
+    from experiments.robustness import switching
+    from experiments.run.benchmark import progress_bar
+    from experiments.run.provenance import provenance
+    from lpv_track_env import conditions
+    from lpv_track_env.validation import checked_threads
+    from trajectories.fileio import write_atomically
+
+    setup = switching.Setup(
+        episodes=options.episodes, conditions=options.conditions, vehicle=options.vehicle,
+        candidates=options.candidates, seed=options.seed, weights=base_of(options.weights),
+        threads=checked_threads(options.threads),
+    )  # fmt: skip
+    conditions.load(setup.conditions)
+    arms = switching.arms_of(spans_of(options.spans))
+    options.out.mkdir(parents=True, exist_ok=True)
+    file: Path = options.out / "switching.json"
+    # Plain values equal to what JSON gives back, for the comparison with a file.
+    plain = json.loads(json.dumps(dataclasses.asdict(setup)))
+    del plain["threads"]
+    done: dict[str, Any] = {}
+    result: dict[str, Any] = {
+        "experiment": "switching",
+        "setup": plain,
+        "window": switching.WINDOW,
+        "bounds": [LOWEST, HIGHEST],
+        "trajectories": setup.trajectories,
+        "sources": _sources(),
+        **provenance(),
+        "arms": done,
+    }
+    kept = _kept(file, result)
+    batches = -(-setup.episodes // switching.BATCH)
+    with resumable(options, console), progress_bar(console) as progress:
+        for number, arm in enumerate(arms, start=1):
+            if arm.label not in kept:
+                bar = progress.add_task(arm.label, total=batches * setup.windows)
+                outcome = switching.drive_arm(setup, arm, partial(progress.advance, bar))
+                kept[arm.label] = switching.summary(outcome)
+            done[arm.label] = {**arm.as_dict(), **kept[arm.label]}
+            write_atomically(file, json.dumps(result, indent=1, allow_nan=False).encode())
+            if not console.is_terminal:
+                console.print(
+                    f"[{number}/{len(arms)}] {arm.label}: {done[arm.label]['lost']} lost",
+                    markup=False, highlight=False,
+                )  # fmt: skip
+    console.print(table(result))
+    console.print(widest_kept(result))
+    console.print(f"written: {file}", markup=False, highlight=False, soft_wrap=True)
+    return 0
+
+
+def _sources() -> str:
+    """Return a digest of the sources that a result depends on."""
+    from experiments.robustness import switching
+    from experiments.run.case import project_digest
+
+    own = Path(switching.__file__).read_text()
+    return hashlib.sha256((project_digest() + own).encode()).hexdigest()[:16]
+
+
+def _kept(file: Path, result: dict[str, Any]) -> dict[str, Any]:
+    """Return the arms of a file written by the same sources and settings; none without one."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        if all(content.get(key) == result[key] for key in ("experiment", "setup", "sources")):
+            return dict(content["arms"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        pass
+    return {}
+
+
+def table(result: Mapping[str, Any]) -> Table:
+    """Return a table with a row for each arm."""
+    setup = result["setup"]
+    shown = Table(
+        title=f"Q and S switched every {result['window']:g} s within a span "
+        f"around base weights; {setup['conditions']}, {setup['episodes']} episodes a row",
+        title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False,
+    )  # fmt: skip
+    shown.add_column("weights, span", no_wrap=True)
+    for heading in (
+        "lost", "rate <\n(95 %)", "failed\nsolves", "\nNaN", "rms\nm", "max |e_y|\nmedian",
+        "\np99", "\nmax",
+    ):  # fmt: skip
+        shown.add_column(heading, justify="right", no_wrap=True)
+    for label, row in result["arms"].items():
+        shown.add_row(
+            label, str(row["lost"]), f"{100.0 * row['lost_upper_bound']:.2f} %",
+            f"{row['failed_solves']}", str(row["not_finite"]), f"{row['rms_lateral']:.3f}",
+            f"{row['largest_lateral_median']:.2f}", f"{row['largest_lateral_p99']:.2f}",
+            f"{row['largest_lateral']:.2f}", style="red" if row["lost"] else "",
+        )  # fmt: skip
+    return shown
+
+
+def widest_kept(result: Mapping[str, Any]) -> str:
+    """Return the widest span of each way to switch in which no vehicle was lost, in words."""
+    from experiments.robustness.switching import CONTROL, WHOLE
+
+    spans: dict[str, list[tuple[float, bool]]] = {}
+    for row in result["arms"].values():
+        if row["mode"] != CONTROL:
+            span = WHOLE if row["span"] is None else row["span"]
+            name = f"{row['mode']}, {'no limit' if row['slew'] is None else 'slew limit'}"
+            spans.setdefault(name, []).append((span, row["lost"] > 0))
+    spans["in every way"] = [row for rows in spans.values() for row in rows]
+    words = []
+    for name, rows in spans.items():
+        lossy = [span for span, lost in rows if lost]
+        widest = max((span for span, _ in rows if not lossy or span < min(lossy)), default=None)
+        text = "no span" if widest is None else f"span {widest:g}"
+        words.append(f"{name}: {'the whole bounds' if widest == WHOLE else text}")
+    return "none lost within: " + "; ".join(words)

@@ -1,18 +1,276 @@
 """`lpv-track train`: train a policy that drives."""
 
 import argparse
+import math
+import shlex
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from experiments.training.options import add_training_options as add_options
+from experiments.commands.options import add_settings, parse_settings, resumable
+from experiments.training import ALGORITHMS
 
-__all__ = ["EXAMPLE", "add_options", "run"]
+if TYPE_CHECKING:
+    from experiments.jobs.job import Line
+    from experiments.training.settings import TrainingSettings
 
 EXAMPLE = "lpv-track train ppo --seed 0 --hours 0.1 --out results/ppo"
+
+REPEATED = (
+    "vehicle", "conditions", "conditions_set", "trajectories", "paths", "envs", "segment",
+    "start", "control_period", "preview_steps", "preview_period", "set", "reward", "device",
+)  # fmt: skip
+"""Options that the provenance's command repeats as they were given."""
+TRIAL_UPDATES = {"ppo": 2, "residual": 2, "sac": 50, "td3": 50, "bc": 1}
+"""Updates in a segment of a trial of `--hours`."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument(
+        "algorithm", choices=ALGORITHMS,
+        help="ppo, sac, td3; bc: cloning of lpv-nmpc with DAgger; residual: ppo on top of lpv-nmpc",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, metavar="DIR", help="default: results/train/ALGORITHM")
+    parser.add_argument("--seed", type=int, default=0, help="0 to 999 (default 0)")
+    parser.add_argument(
+        "--steps", type=float, metavar="N", help="budget in environment steps, e.g. 2e7"
+    )
+    parser.add_argument(
+        "--hours", type=float, metavar="H",
+        help="budget in hours: as many steps as a trial says will fit, or --steps cut short",
+    )  # fmt: skip
+    parser.add_argument("--resume", action="store_true", help="go on from DIR's last checkpoint")
+    parser.add_argument(
+        "--fast",
+        action="store_true",
+        help="ppo: simulation only, half the updates, less than a minute",
+    )
+    parser.add_argument("--vehicle", metavar="NAME", help="preset or .json (default m2-minibus)")
+    parser.add_argument(
+        "--conditions", nargs="+", metavar="NAME",
+        help="kinds that share the environments (default: simulation realtime)",
+    )  # fmt: skip
+    add_settings(
+        parser, "--conditions-set", "fields to change in each of them, e.g. friction=[0.4,1.0]"
+    )
+    parser.add_argument(
+        "--trajectories",
+        nargs="+",
+        metavar="NAME",
+        help="own paths in place of random ones; not those of the suites paper and learned",
+    )
+    parser.add_argument("--paths", type=int, metavar="N", help="random paths (default 48)")
+    parser.add_argument(
+        "--envs", type=int, metavar="N",
+        help="environments side by side (default: ppo 512, residual and bc 256, others 64)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--segment", type=int, metavar="N",
+        help="steps between checkpoints, each with a validation (default: ppo 1,000,000, residual "
+        "250,000, others 100,000)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--from",
+        dest="start",
+        metavar="POLICY",
+        help="policy file to start from, e.g. of bc; ppo fits its value function alone in the "
+        "first segment",
+    )
+    parser.add_argument("--control-period", type=float, metavar="S", help="s (default 0.05)")
+    parser.add_argument("--preview-steps", type=int, metavar="K", help="default 20")
+    parser.add_argument(
+        "--preview-period", type=float, metavar="S", help="s (default: the control period)"
+    )
+    add_settings(
+        parser, "--set",
+        "hyperparameters, e.g. learning_rate=3e-4 hidden=[128,128]. All: learning_rate, "
+        "last_learning_rate, hidden, activation, origin; ppo and residual: rollout, batch, epochs, "
+        "discount, gae_lambda, clip_range, deviation; sac and td3: buffer, batch, gradient_steps, "
+        "learning_starts, discount, target_rate, td3 noise; bc: round, updates, batch, "
+        "expert_share, noise",
+    )  # fmt: skip
+    add_settings(parser, "--reward", "reward weights, e.g. input_rate=1.0 lateral_scale=0.1")
+    parser.add_argument(
+        "--device", metavar="NAME", help="cpu, cuda or auto (default: CUDA where there is one)"
+    )
+
+
+def settings_of(options: argparse.Namespace) -> "TrainingSettings":
+    """Return the settings that the options ask for.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name or an impossible value.
+    """
+    from experiments.jobs.console import whole_number
+    from experiments.training.settings import FAST, usual
+
+    changes = parse_settings(options.conditions_set)
+    kinds = [{"name": name, **changes} if changes else name for name in options.conditions or ()]
+    if changes and not kinds:
+        raise ValueError("--conditions-set needs --conditions, which it changes")
+    given: dict[str, Any] = {
+        "steps": None if options.steps is None else whole_number(options.steps, "--steps"),
+        "seed": options.seed,
+        "vehicle": options.vehicle,
+        "conditions": kinds or None,
+        "envs": options.envs,
+        "segment": options.segment,
+        "trajectories": options.trajectories,
+        "paths": options.paths,
+        "start": options.start,
+        "device": options.device,
+        "control_period": options.control_period,
+        "preview_steps": options.preview_steps,
+        "preview_period": options.preview_period,
+    }
+    given = {key: value for key, value in given.items() if value is not None}
+    hyperparameters = parse_settings(options.set)
+    if options.fast:
+        if options.algorithm != "ppo":
+            raise ValueError("--fast is for ppo")
+        hyperparameters = {**FAST["hyperparameters"], **hyperparameters}
+        given = {**FAST, **given}
+    reward = parse_settings(options.reward)
+    settings = usual(options.algorithm, **{**given, "hyperparameters": hyperparameters})
+    return replace(settings, reward={**settings.reward, **reward}) if reward else settings
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command and return its exit code."""
-    from experiments.training.command import run_training
+    from experiments.jobs.console import Display, check_resume, need
 
-    return run_training(options, console)
+    need("training", "rl", "stable_baselines3", "torch", "tensorboard")
+    from experiments.jobs.job import stored_settings
+    from experiments.training.loop import POLICY, train
+    from experiments.training.settings import with_steps
+
+    folder = options.out = options.out or Path("results/train") / options.algorithm
+    resumed = check_resume(folder, "training", resume=options.resume)
+    settings = settings_of(options)
+    at_most = math.inf
+    if options.hours is not None:
+        if not options.hours > 0.0:
+            raise ValueError(f"--hours must be positive, not {options.hours}")
+        at_most = 3600.0 * options.hours
+        if options.steps is None and resumed:
+            # The number of steps that the first run found for its hours.
+            stored = stored_settings(folder, "training") or {}
+            settings = with_steps(settings, int(stored["steps"]))
+        elif options.steps is None:
+            settings, at_most = fit_steps(settings, at_most, console)
+
+    class TrainingDisplay(Display):
+        """A line for every segment."""
+
+        def tick(self, done: int, words: str) -> None:
+            self.show(done, f"{settings.algorithm} {words}")
+
+        def line(self, line: "Line") -> None:
+            validation = line["validation"]
+            self.say(
+                f"{line['steps']:>11,} steps {line['seconds']:5.0f} s  "
+                f"loss {validation['loss']:7.4f}  finished {validation['finished']:4.0%}  "
+                f"ALE {validation['mean_ale']:.4f} m{'  best' if line['best'] else ''}"
+            )
+
+    display = TrainingDisplay(console, settings.steps)
+    with resumable(options, console, "the same command with --resume"), display.progress:
+        lines = train(
+            settings, folder, display, command=command_line(settings, options),
+            seconds_at_most=at_most,
+        )  # fmt: skip
+    last = lines[-1]
+    draw(lines, folder / "training.png")
+    console.print(
+        f"{last['steps']:,} steps in {last['seconds']:.0f} s, {last['learning_seconds']:.0f} s of "
+        f"them learning ({last['steps'] / last['learning_seconds']:,.0f} steps a second), "
+        f"{last['solves']:,} NMPC solves; policy: {folder / POLICY}",
+        markup=False, highlight=False, soft_wrap=True,
+    )  # fmt: skip
+    return 0
+
+
+def command_line(settings: "TrainingSettings", options: argparse.Namespace) -> str:
+    """Return the command that makes the policy again: with `--steps`, also for `--hours`."""
+    from experiments.jobs.console import repeated
+
+    words = ["lpv-track", "train", settings.algorithm, "--steps", str(settings.steps)]
+    words += ["--seed", str(settings.seed), *repeated(options, REPEATED, {"start": "--from"})]
+    return shlex.join([*words, *(["--fast"] if options.fast else [])])
+
+
+def fit_steps(
+    settings: "TrainingSettings", seconds: float, console: Console
+) -> tuple["TrainingSettings", float]:
+    """Return the settings with as many steps as fit into a time, and the time left for them.
+
+    A short trial of the same training, which is thrown away, measures steps and validation.
+    """
+    from experiments.jobs.job import Listener
+    from experiments.training.loop import train
+    from experiments.training.settings import with_steps
+
+    console.print("measuring how many steps the time allows ...")
+    began = time.perf_counter()
+    trial = trial_of(settings)
+    with tempfile.TemporaryDirectory() as scratch:
+        lines = train(trial, Path(scratch), Listener(), command="trial")
+    left = max(seconds - (time.perf_counter() - began), 1.0)
+    # The first segment includes compilation.
+    first, last = lines[0], lines[-1]
+    driven = last["steps"] - first["steps"]
+    learning = last["learning_seconds"] - first["learning_seconds"]
+    validating = (last["seconds"] - first["seconds"] - learning) / (len(lines) - 1)
+    step = learning / driven + validating / settings.segment
+    least = settings.segment if settings.start else trial.segment
+    steps = max(int(left / step), least + 1)
+    console.print(f"{1.0 / step:,.0f} steps a second with validation: {steps:,}", highlight=False)
+    return with_steps(settings, steps), left
+
+
+def trial_of(settings: "TrainingSettings") -> "TrainingSettings":
+    """Return the same training in three short segments, each with updates of the networks."""
+    hyper = dict(settings.hyperparameters)
+    once = settings.envs * hyper.get("rollout", hyper.get("round", 1))
+    short = once * TRIAL_UPDATES[settings.algorithm]
+    if "learning_starts" in hyper:
+        hyper["learning_starts"] = once
+    return replace(settings, steps=3 * short, segment=short, hyperparameters=hyper)
+
+
+def draw(lines: Sequence["Line"], file: Path) -> None:
+    """Draw ALE and steering of the validation drives over the steps."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
+
+    from experiments.figures import COLOURS, save_figure
+
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    steps = [line["steps"] for line in lines]
+    for axes, key, label in (
+        (left, "mean_ale", "ALE m, mean of validation drives"),
+        (right, "mean_steering_variation", "steering variation rad, mean"),
+    ):
+        values = [line["validation"][key] for line in lines]
+        axes.plot(steps, values, color=COLOURS[0], marker=".")
+        best = [k for k, line in enumerate(lines) if line["best"]][-1]
+        axes.plot(steps[best], values[best], "o", color=COLOURS[1], label="kept")
+        axes.set(xlabel="steps", ylabel=label)
+        axes.grid(alpha=0.3)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    # The first policies leave the road: the scale is that of the later half.
+    left.set_ylim(
+        0.0, 1.3 * max(line["validation"]["mean_ale"] for line in lines[len(lines) // 2 :])
+    )
+    left.legend()
+    figure.suptitle(f"{lines[-1]['seconds']:.0f} s, {lines[-1]['solves']:,} NMPC solves")
+    save_figure(figure, file)

@@ -1,18 +1,173 @@
 """`lpv-track tune`: tune the NMPC's weights."""
 
 import argparse
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from experiments.tuning.options import add_tuning_options as add_options
+from experiments.commands.options import add_conditions, add_settings, parse_settings, resumable
+from experiments.tuning import METHODS
 
-__all__ = ["EXAMPLE", "add_options", "run"]
+if TYPE_CHECKING:
+    from experiments.jobs.job import Line
+    from experiments.tuning.settings import TuningSettings
 
 EXAMPLE = "lpv-track tune --method rl --seed 0 --out results/tune/rl"
+
+REPEATED = (
+    "vehicle", "conditions", "conditions_set", "trajectories", "paths", "drives", "time_limit",
+    "control_period", "preview_steps", "preview_period", "directions", "span", "window", "view",
+    "set",
+)  # fmt: skip
+"""Options that the provenance's command repeats as they were given."""
+PACKAGES = {
+    "paper": ("tune", "cma"),
+    "search": ("tune", "cma"),
+    "bands": ("tune", "cma"),
+    "gradient": ("tune", "cma"),
+    "catalogue": ("rl", "stable_baselines3"),
+    "rl": ("rl", "stable_baselines3"),
+}
+"""Extra that a method needs, and the package that it is checked by."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument(
+        "--method", choices=METHODS, required=True,
+        help="fixed: the default weights; paper: a set by the path's sharpest curvature; search: "
+        "the best fixed set, by CMA-ES; bands: a set a band of curvature, by CMA-ES; gradient: the "
+        "same by gradients of the closed loop; catalogue: PPO chooses sets while driving; rl: PPO "
+        "multiplies weights while driving; paired: a linear policy does, learned from drives "
+        "alike but for their weights",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, metavar="DIR", help="default: results/tune/METHOD")
+    parser.add_argument(
+        "--solves", type=float, default=300_000, metavar="N",
+        help="budget in solves of the NMPC, e.g. 3e6 (default 3e5); never exceeded",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, help="0 to 999 (default 0)")
+    parser.add_argument("--resume", action="store_true", help="go on with what DIR holds")
+    parser.add_argument("--vehicle", metavar="NAME", help="preset or .json (default m2-minibus)")
+    parser.add_argument(
+        "--trajectories", "--paths", nargs="+", metavar="PATH", dest="trajectories",
+        help="own paths, names or files, in place of random ones; not those of the evaluation",
+    )  # fmt: skip
+    parser.add_argument(
+        "--random-paths", type=int, metavar="N", dest="paths", help="random paths (default 32)"
+    )
+    add_conditions(
+        parser, None, "simulation, realtime, randomised (default: randomised)",
+        "fields to change in them, e.g. gnss_noise=[0.01,0.3]",
+    )  # fmt: skip
+    parser.add_argument(
+        "--drives", type=int, metavar="N",
+        help="drives that judge a candidate (default 16), environments of PPO (default 64), drives "
+        "of paired (default 32)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--time-limit", type=float, metavar="S", help="of a drive (default 10 s, PPO 20 s)"
+    )
+    parser.add_argument("--control-period", type=float, metavar="S", help="s (default 0.05)")
+    parser.add_argument("--preview-steps", type=int, metavar="K", help="default 20")
+    parser.add_argument(
+        "--preview-period", type=float, metavar="S", help="s (default: the control period)"
+    )
+    parser.add_argument(
+        "--directions", metavar="NAME",
+        help="what is chosen apart: joint (speed, heading, position), stages (these in Q and in S, "
+        "the default), all (each of Q and S)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--span", type=float, metavar="F", help="largest factor on a default weight (default 100)"
+    )
+    parser.add_argument("--window", type=float, metavar="S", help="between decisions (default 0.4)")
+    parser.add_argument(
+        "--view", metavar="NAME",
+        help="what catalogue and rl see: all (default), path (curvature, speed, band), drive "
+        "(errors' history, lags, noise)",
+    )  # fmt: skip
+    add_settings(
+        parser, "--set",
+        "hyperparameters: sigma of search and gradient; pairs, learning_rate of gradient; of "
+        "catalogue and rl learning_rate, last_learning_rate, rollout, batch, epochs, discount, "
+        "gae_lambda, clip_range, deviation, hidden, segment; of paired deviation, hold, curvature, "
+        "response, least_curvature, half_life, step",
+    )  # fmt: skip
+
+
+def settings_of(options: argparse.Namespace) -> "TuningSettings":
+    """Return the settings that the options ask for.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name or an impossible value.
+    """
+    from experiments.jobs.console import whole_number
+    from experiments.tuning.settings import TuningSettings, usual
+
+    solves = whole_number(options.solves, "--solves")
+    changes = parse_settings(options.conditions_set)
+    kind = options.conditions or "randomised"
+    fields = TuningSettings.__dataclass_fields__
+    given = {name: getattr(options, name) for name in REPEATED if name in fields}
+    return usual(
+        options.method, **{
+            **given, "solves": solves, "seed": options.seed,
+            "conditions": {"name": kind, **changes} if changes else kind,
+            "hyperparameters": parse_settings(options.set),
+        },
+    )  # fmt: skip
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command and return its exit code."""
-    from experiments.tuning.command import run_tuning
+    from experiments.jobs.console import Display, check_resume, need
 
-    return run_tuning(options, console)
+    if options.method in PACKAGES:
+        need(f"tune --method {options.method}", *PACKAGES[options.method])
+    from experiments.tuning.loop import WEIGHTS, tune
+
+    folder = options.out = options.out or Path("results/tune") / options.method
+    check_resume(folder, "tuning", resume=options.resume)
+    settings = settings_of(options)
+
+    class TuningDisplay(Display):
+        """A line for every tenth of the budget."""
+
+        printed = 0
+
+        def line(self, line: "Line") -> None:
+            self.show(line["solves"], f"{settings.method} score {line['score']:.3f}")
+            if (tenth := 10 * line["solves"] // settings.solves) > self.printed:
+                self.printed = tenth
+                self.say(
+                    f"{line['solves']:>11,} solves {line['seconds']:5.0f} s  score of what was "
+                    f"tried {line['score']:.3f}"
+                )
+
+    display = TuningDisplay(console, settings.solves)
+    with resumable(options, console, "the same command with --resume"), display.progress:
+        lines = tune(settings, folder, display, command=command_line(settings, options))
+    if not lines:
+        console.print(f"the default weights: {folder / WEIGHTS}", markup=False, soft_wrap=True)
+        return 0
+    last = lines[-1]
+    console.print(
+        f"{last['solves']:,} solves in {last['seconds']:.0f} s; weights: {folder / WEIGHTS} "
+        f"(lpv-track benchmark --agents lpv-nmpc-tuned --agent-set weights={folder / WEIGHTS})",
+        markup=False, highlight=False, soft_wrap=True,
+    )  # fmt: skip
+    return 0
+
+
+def command_line(settings: "TuningSettings", options: argparse.Namespace) -> str:
+    """Return the command that makes the weights again."""
+    from experiments.jobs.console import repeated
+
+    words = ["lpv-track", "tune", "--method", settings.method, "--solves", str(settings.solves)]
+    words += ["--seed", str(settings.seed)]
+    return shlex.join([*words, *repeated(options, REPEATED, {"paths": "--random-paths"})])

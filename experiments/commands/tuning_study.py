@@ -1,18 +1,97 @@
 """`lpv-track tuning-study`: compare the ways to weights."""
 
 import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from experiments.tuning.options import add_study_options as add_options
+from experiments.commands.options import add_out, resumable
 
-__all__ = ["EXAMPLE", "add_options", "run"]
+if TYPE_CHECKING:
+    from experiments.study.study import Study
 
 EXAMPLE = "lpv-track tuning-study --seeds 10 --out results/tuning-study"
 
 
-def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command and return its exit code."""
-    from experiments.study.command import run_study
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    add_out(parser, "results/tuning-study")
+    parser.add_argument(
+        "--seeds", type=int, default=10, metavar="N", help="trainings a rung (default 10)"
+    )
+    parser.add_argument(
+        "--solves", type=float, default=300_000, metavar="N", help="of a training (default 3e5)"
+    )
+    parser.add_argument(
+        "--rungs", nargs="+", metavar="NAME", help="default: all; an unknown one lists them"
+    )
+    parser.add_argument(
+        "--drives", type=int, default=8, metavar="N",
+        help="drives a path that judge a training (default 8)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--tracks", type=Path, metavar="DIR",
+        help="folder of TUMFTM centre lines (x_m,y_m,...): one more set",
+    )  # fmt: skip
+    parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2)")
+    parser.add_argument(
+        "--quick", action="store_true",
+        help="2 trainings of 60,000 solves, 2 drives a path, small oracles: what it looks like",
+    )  # fmt: skip
 
-    return run_study(options, console)
+
+def study_of(options: argparse.Namespace) -> "Study":
+    """Return the study that the options ask for.
+
+    Raises
+    ------
+    ValueError
+        For an unknown rung, an impossible number, or a folder without tracks.
+    """
+    from experiments.jobs.console import whole_number
+    from experiments.study.evaluation import track_set, usual_sets
+    from experiments.study.study import RUNGS, Study, checked_labels
+
+    solves = whole_number(options.solves, "--solves")
+    if options.seeds < 1 or options.drives < 2:
+        raise ValueError("--seeds must be at least 1, --drives at least 2")
+    labels = checked_labels(options.rungs or [rung.label for rung in RUNGS])
+    quick = options.quick
+    sets = usual_sets(2 if quick else options.drives)
+    if options.tracks is not None:
+        sets.append(track_set(options.tracks, options.drives))
+    return Study(
+        options.out, labels, tuple(range(2 if quick else options.seeds)),
+        60_000 if quick else solves, tuple(sets),
+    )  # fmt: skip
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the command and return its exit code: trainings, evaluations, oracles, report."""
+    from collections.abc import Iterator
+
+    from experiments.run.benchmark import progress_bar
+    from experiments.study.oracle import study_oracles
+    from experiments.study.report import write_report
+    from experiments.study.study import run_evaluations, run_trainings
+
+    study = study_of(options)
+    study.claim()
+    with resumable(options, console), progress_bar(console) as progress:
+
+        def follow(words: str, steps: Iterator[tuple[int, int]]) -> None:
+            bar = progress.add_task(words, total=None)
+            for done, count in steps:
+                progress.update(bar, completed=done, total=count or 1)
+            progress.update(bar, completed=1, total=1)
+
+        follow("trainings", run_trainings(study, options.workers))
+        follow("judging", run_evaluations(study, options.workers))
+        headroom, greedy = study_oracles(study, quick=options.quick, follow=follow)
+    report = study.folder / "report.html"
+    summary = write_report(study, headroom, greedy, report)
+    for line in summary["ladder"]:
+        console.print("  ".join(line[:1] + line[2:10]), markup=False, highlight=False)
+    console.print(f"report: {report}", markup=False, soft_wrap=True)
+    return 0

@@ -1,8 +1,8 @@
-"""Vehicles whose weights are switched at random, or by an adversary: how often they are lost."""
+"""How often vehicles are lost when weights are switched at random or by an adversary."""
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,19 +15,24 @@ from agents.weight_tuning.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.features import TUNED
 from agents.weight_tuning.score import failed
 from agents.weights import HIGHEST, LOWEST, TrackingWeights
+from experiments.run.statistics import rate_bound
+from lpv_track_env import kernels as k
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 
 Array = NDArray[Any]
 
 PATHS = 40
 WINDOW = 0.4
-"""s between switches: a tuner's."""
+"""Time between switches, s: that of the tuned policies."""
 TIME_LIMIT = 20.0
 BATCH = 250
-"""Episodes at once."""
+"""Episodes driven side by side."""
 CONTROL, RANDOM, ADVERSARY = "not switched", "random", "adversary"
 WHOLE = math.inf
-"""Span of the whole bounds of weights."""
+"""Span that stands for the whole bounds of weights."""
+BEFORE = 5
+"""Windows before a loss whose weights are compared with all others: 2 s."""
+TUNED_NAMES = tuple(f"{matrix}_{state}" for matrix in "QS" for state in ("vx", "psi", "x", "y"))
 
 
 @dataclass(frozen=True)
@@ -37,12 +42,11 @@ class Arm:
     Parameters
     ----------
     mode
-        `CONTROL`: the base weights throughout; `RANDOM`: Q and S drawn anew in every window;
-        `ADVERSARY`: that one of several draws under which the window's largest lateral error turns
-        out worst, whatever comes of it later.
+        `CONTROL`: the base weights throughout. `RANDOM`: Q and S are drawn anew in every window.
+        `ADVERSARY`: of several draws, the one with the largest lateral error in the window.
     span
-        Each of Q and S is drawn by itself, log-uniformly, from the base weight divided by it to
-        that times it; `WHOLE`: from the bounds of weights.
+        Each weight of Q and S is drawn independently and log-uniformly between base / span and
+        base * span; `WHOLE`: between the bounds of weights.
     slew
         Largest change of a weight's logarithm, 1/s.
     """
@@ -53,21 +57,21 @@ class Arm:
 
     @property
     def label(self) -> str:
-        """Its name in results."""
+        """Name in results."""
         if self.mode == CONTROL:
             return self.mode
         span = "whole" if self.span == WHOLE else f"{self.span:g}"
         return f"{self.mode}, {span}, {'no limit' if self.slew == math.inf else 'slew limit'}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values; None: no limit, and the whole bounds."""
+        """Return plain values; None for no limit, and for the whole bounds."""
         span = None if self.span == WHOLE else self.span
         return {
             "mode": self.mode, "span": span, "slew": None if self.slew == math.inf else self.slew,
         }  # fmt: skip
 
     def draw(self, rng: np.random.Generator, count: int, base: Array) -> Array:
-        """Sets of weights, (count, 10), around the base (10,)."""
+        """Draw sets of weights (count, 10) around the base (10,)."""
         sets = np.tile(base, (count, 1))
         if self.mode == CONTROL:
             return sets
@@ -81,7 +85,7 @@ class Arm:
 
 
 def arms_of(spans: tuple[float, ...]) -> list[Arm]:
-    """The control, and both ways to switch over every span, with the tuner's slew limit and not."""
+    """Return the control and both ways to switch, over every span, with and without slew limit."""
     switched = [
         Arm(mode, span, slew)
         for span in spans
@@ -93,7 +97,7 @@ def arms_of(spans: tuple[float, ...]) -> list[Arm]:
 
 @dataclass(frozen=True)
 class Setup:
-    """What is driven: random paths, in turn quiet and fast, each episode from anywhere on one."""
+    """Episodes to drive: on random paths, slow and fast in turn, each from a random place."""
 
     episodes: int = 2000
     conditions: str = "realtime"
@@ -101,7 +105,7 @@ class Setup:
     paths: int = PATHS
     time_limit: float = TIME_LIMIT
     candidates: int = 4
-    """Draws that the adversary chooses from."""
+    """Number of draws that the adversary chooses from."""
     seed: int = 0
     weights: TrackingWeights = field(default_factory=TrackingWeights)
     """Base weights."""
@@ -121,13 +125,13 @@ class Setup:
 
     @property
     def windows(self) -> int:
-        """Switches of a whole episode."""
+        """Number of windows in an episode that ends by its time limit."""
         return math.ceil(self.time_limit / WINDOW - 1e-9)
 
 
 @dataclass
 class Outcome:
-    """What came of the episodes of an arm; arrays with an entry an episode."""
+    """Results of the episodes of an arm; arrays with an entry for each."""
 
     seeds: Array
     ends: Array
@@ -139,15 +143,15 @@ class Outcome:
     failures: Array
     """Failed solves."""
     not_finite: Array
-    """Whether a number of the vehicle, its action or its weights ever was not finite."""
+    """True if a number of the vehicle, its action or its weights was ever not finite."""
     used: Array
-    """ln(Q, S in use / base) at the end of each window, (episodes, windows, 8); NaN after."""
+    """ln(Q, S in use / base) at the ends of windows, (episodes, windows, 8); NaN after an end."""
     statuses: Counter[str] = field(default_factory=Counter)
-    """Failed solves by status, and what replaced them."""
+    """Failed solves by status, and the fallbacks that replaced them."""
 
 
 class Branches:
-    """A closed loop in which every episode has a number of branches, from window to window."""
+    """A closed loop in which every episode has several branches, from window to window."""
 
     def __init__(self, setup: Setup, arm: Arm, episodes: int) -> None:
         self.arm, self.episodes = arm, episodes
@@ -201,14 +205,14 @@ class Branches:
         )  # fmt: skip
 
     def _worst(self, tally: Tally) -> Array:
-        """Row of the branch of each episode in which the window went worst, (episodes,)."""
+        """Return the row of each episode's branch with the worst window, (episodes,)."""
         harm = np.where(failed(self.loop.envs.arrays.ends), np.inf, tally.max_lateral)
         harm = np.nan_to_num(harm.reshape(self.episodes, self.count), nan=np.inf, posinf=np.inf)
         chosen: Array = np.arange(self.episodes) * self.count + harm.argmax(axis=1)
         return chosen
 
     def _follow(self, chosen: Array, running: Array) -> None:
-        """Have all branches of the running episodes go on from the chosen one."""
+        """Continue all branches of the running episodes from the chosen one."""
         if self.count == 1:
             return
         rows = np.flatnonzero(np.repeat(running, self.count))
@@ -216,7 +220,7 @@ class Branches:
 
 
 def drive_arm(setup: Setup, arm: Arm, tick: Callable[[], None]) -> Outcome:
-    """Drive all episodes of an arm; the same in every arm, but for the weights."""
+    """Drive all episodes of an arm; arms differ in the weights alone."""
     parts: list[Outcome] = []
     branches: Branches | None = None
     for first in range(0, setup.episodes, BATCH):
@@ -231,3 +235,56 @@ def drive_arm(setup: Setup, arm: Arm, tick: Callable[[], None]) -> Outcome:
         if name != "statuses"
     }
     return Outcome(**arrays, statuses=sum((part.statuses for part in parts), Counter()))
+
+
+def summary(outcome: Outcome) -> dict[str, Any]:
+    """Return the results of an arm in plain values."""
+    lost = failed(outcome.ends)
+    episodes, failures = len(lost), int(lost.sum())
+    ends = Counter(k.END_NAMES[int(end)] for end in outcome.ends)
+    kept = outcome.largest[~lost]
+    return {
+        "episodes": episodes,
+        "lost": failures,
+        "lost_seeds": outcome.seeds[lost].tolist(),
+        "lost_upper_bound": rate_bound(failures, episodes),
+        "ends": dict(ends),
+        "not_finite": int(outcome.not_finite.sum()),
+        "periods": int(outcome.steps.sum()),
+        "solves": int(outcome.solves.sum()),
+        "failed_solves": int(outcome.failures.sum()),
+        "episodes_with_failed_solves": int((outcome.failures > 0).sum()),
+        "failed_by_status": dict(outcome.statuses),
+        "rms_lateral": math.sqrt(outcome.lateral_square.sum() / max(outcome.steps.sum(), 1.0)),
+        "largest_lateral": float(outcome.largest.max()),
+        "largest_lateral_not_lost": float(kept.max()) if kept.size else None,
+        "largest_lateral_median": float(np.median(outcome.largest)),
+        "largest_lateral_p99": float(np.quantile(outcome.largest, 0.99)),
+        "weights_before_loss": weights_before_loss(outcome) if failures else None,
+    }
+
+
+def weights_before_loss(outcome: Outcome) -> Mapping[str, Any]:
+    """Compare the weights in the last windows of lost episodes with those of all windows.
+
+    For log10(weight / base), for its mean over the four weights on position and for differences:
+    the mean before a loss, the mean and the standard deviation over all windows.
+    """
+    lost = failed(outcome.ends)
+    decades = outcome.used / np.float32(math.log(10.0))
+    driven = np.isfinite(decades[:, :, 0])
+    left = driven[:, ::-1].cumsum(axis=1)[:, ::-1]
+    before = driven & (left <= BEFORE) & lost[:, None]
+    values = {name: decades[:, :, j] for j, name in enumerate(TUNED_NAMES)}
+    values["Q_psi - Q_y"] = values["Q_psi"] - values["Q_y"]
+    values["S_psi - S_y"] = values["S_psi"] - values["S_y"]
+    values["position"] = decades[:, :, [2, 3, 6, 7]].mean(axis=2)
+    values["Q_vx - position"] = values["Q_vx"] - values["position"]
+    return {
+        name: {
+            "before_loss": float(value[before].mean()),
+            "all": float(value[driven].mean()),
+            "spread": float(value[driven].std()),
+        }
+        for name, value in values.items()
+    }

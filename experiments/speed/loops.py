@@ -200,15 +200,15 @@ def training(section: Section, effort: Effort, tick: Tick) -> None:
         return
     from stable_baselines3.common.logger import Logger
 
-    from experiments.training.environments import load_paths
-    from experiments.training.loop import make_trainer
+    from experiments.jobs.paths import load_paths
+    from experiments.training.loop import make_trainer, path_names
     from experiments.training.settings import FAST, usual
 
     settings = usual("ppo", **{**FAST, "paths": 4})
     segment = max(settings.envs * settings.hyperparameters["rollout"], 8 * effort.learning_steps)
     settings = replace(settings, steps=segment * (effort.learning_rounds + 1), segment=segment)
     tick("training: loading paths")
-    trainer: Any = make_trainer(settings, load_paths(settings), Logger(None, []))
+    trainer: Any = make_trainer(settings, load_paths(path_names(settings)), Logger(None, []))
     series = section.add("PPO, --fast", "s/env-step of learning", n=settings.envs)
     trainer.segment(0, lambda *_: None)
     for number in range(1, settings.segments):

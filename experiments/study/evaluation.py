@@ -1,9 +1,10 @@
-"""Weights judged on paths that nothing was tuned on: whole drives in compiled closed loops.
+"""Evaluation of weights on paths that nothing was tuned on: whole drives in compiled closed loops.
 
-Bit for bit what `lpv-track benchmark` drives with `lpv-nmpc-tuned`, but for the drives' batches.
+The drives are those of `lpv-track benchmark` with `lpv-nmpc-tuned`, bit for bit, only in batches.
 """
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,22 +17,38 @@ from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import PARTS, SCALES, failed, parts_of, scores_of
 from experiments.run.metrics import BANDS
 from experiments.run.suites import HELD_OUT, RAW, RAW_PREVIEW, SIX
-from experiments.tuning.drives import threads
-from experiments.tuning.tuner import Result
+from experiments.tuning.tuner import Result, threads
 from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import VX, VY
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import ReferencePath
+from trajectories.importers import read_racetrack
 
 Array = NDArray[Any]
+
+KEPT = 1e-3
+"""A constraint broken by no more than this counts as kept, as in `experiments.run.metrics`."""
+IN_BANDS = tuple(f"in_{name}" for name in BANDS.names)
+"""Names of the scores of the periods in each band of |curvature| at the foot point."""
+FIGURES = (
+    *PARTS, "score", "max_cte", "ale", "aoe", "failed", "violated", "clipped", "failures",
+    *IN_BANDS,
+)  # fmt: skip
+"""Names of the figures of a drive.
+
+The parts of the score and the score; the largest lateral error (m) and its rms (m); the heading
+error's rms (rad); 1 if the drive failed; the shares of periods in which |vy| / vx or the steering's
+or jerk's limit was broken, and in which an actuator clipped its command; failed solves; the scores
+in bands, NaN where the path has none.
+"""
 
 
 @dataclass(frozen=True)
 class EvaluationSet:
-    """Paths and conditions to judge weights on, each path driven once a seed.
+    """Paths and conditions to evaluate weights on; each path is driven once for every seed.
 
-    Seeds count from 0: no tuning, training or validation draws from them.
+    Seeds count from 0, which no tuning, training or validation uses.
     """
 
     name: str
@@ -50,11 +67,14 @@ class EvaluationSet:
 
 
 def usual_sets(seeds: int) -> list[EvaluationSet]:
-    """Held-out random paths, also with less to hinder, the paper's six, and their raw waypoints."""
+    """Return the sets of the study: held-out random paths, the paper's six, raw waypoints.
+
+    The held-out paths also come without disturbances, and with perfect sensors.
+    """
     return [
         EvaluationSet("held-out", HELD_OUT, seeds=seeds),
         EvaluationSet("held-out, simulation", HELD_OUT, "simulation", 1),
-        # Whatever weights are, no controller knows its state better than this.
+        # The best state knowledge that a controller can have, whatever its weights.
         EvaluationSet(
             "held-out, perfect sensors",
             HELD_OUT,
@@ -67,28 +87,25 @@ def usual_sets(seeds: int) -> list[EvaluationSet]:
     ]
 
 
-IN_BANDS = tuple(f"in_{name}" for name in BANDS.names)
-FIGURES = (
-    *PARTS, "score", "max_cte", "ale", "aoe", "failed", "violated", "clipped", "failures",
-    *IN_BANDS,
-)  # fmt: skip
-"""Of every drive: parts of the score and the score; the largest lateral error (m), its rms (m), the
-heading error's (rad); whether it failed; shares of periods in which |vy| / vx or the steering's or
-jerk's limit was broken, and in which an actuator clipped its command; failed solves; the score of
-the periods in each band of |curvature| at the foot point alone, NaN where there is none."""
+def track_set(folder: Path, seeds: int) -> EvaluationSet:
+    """Return a set of real circuits in their own size, whose bends the default vehicle can steer.
 
-
-class Judge:
-    """Drives of an evaluation set, made once for many weights.
-
-    Parameters
-    ----------
-    given
-        What to drive.
+    Raises
+    ------
+    ValueError
+        If the folder holds no centre line.
     """
+    files = sorted(folder.glob("*.csv"))
+    if not files:
+        raise ValueError(f"{folder} holds no .csv of a centre line")
+    paths = tuple(read_racetrack(file) for file in files)
+    return EvaluationSet("real circuits, randomised", paths, "randomised", max(seeds // 4, 2))
+
+
+class Evaluator:
+    """Environments of an evaluation set, made once to evaluate many weights."""
 
     def __init__(self, given: EvaluationSet) -> None:
-        self.given = given
         settings: dict[str, Any] = {
             "conditions": given.conditions, "autoreset_mode": "Disabled", **given.env_settings,
         }  # fmt: skip
@@ -97,15 +114,15 @@ class Judge:
             for path in given.trajectories
         ]
 
-    def judge(self, result: Result, *, by_path: bool = False) -> dict[str, Array]:
-        """Figures of every drive, (paths, seeds) each, by the names in `FIGURES`.
+    def evaluate(self, result: Result, *, by_path: bool = False) -> dict[str, Array]:
+        """Drive the set; return the figures of every drive, (paths, seeds) each, by `FIGURES`.
 
         Parameters
         ----------
         result
             A schedule or a policy.
         by_path
-            Whether a schedule's set is chosen once, by the path's sharpest curvature.
+            Choose a schedule's set once, by the path's sharpest curvature.
         """
         rows = [self._drive(envs, result, by_path) for envs in self.drives]
         return {name: np.stack([row[name] for row in rows]) for name in FIGURES}
@@ -125,7 +142,7 @@ class Judge:
 
 
 def loop_with(result: Result, envs: PathTrackingVectorEnv, *, by_path: bool = False) -> ClosedLoop:
-    """Closed loop of environments in which a schedule or a policy chooses the weights."""
+    """Return the closed loop of environments with a schedule or a policy choosing the weights."""
     settings: dict[str, Any] = {}
     decider = None
     if isinstance(result, WeightPolicy):
@@ -137,7 +154,7 @@ def loop_with(result: Result, envs: PathTrackingVectorEnv, *, by_path: bool = Fa
 
 
 def figures_of(tally: Tally, envs: PathTrackingVectorEnv, trace: Array) -> dict[str, Array]:
-    """Figures of drives that have ended, (n,) each; `trace` (n, 1 + periods, RECORD_SIZE)."""
+    """Return figures of ended drives, (n,) each; `trace` (n, 1 + periods, RECORD_SIZE)."""
     ends, car, period = envs.arrays.ends, envs.single.vehicle, envs.single.control_period
     parts, steps = parts_of(tally), np.maximum(tally.steps, 1.0)
     driven = np.isfinite(trace[:, 1:, 0])
@@ -165,7 +182,7 @@ def figures_of(tally: Tally, envs: PathTrackingVectorEnv, trace: Array) -> dict[
 
 
 def band_scores(trace: Array, path: ReferencePath, env: PathTrackingEnv) -> dict[str, Array]:
-    """Scores of drives by what happened in each band, (n,) each; `trace` as in `figures_of`."""
+    """Return scores of the periods in each band, (n,) each; `trace` as in `figures_of`."""
     after = trace[:, 1:]
     rates = np.diff(trace[:, :, [k.STEERING, k.ACCELERATION]], axis=1) / env.control_period
     errors = after[:, :, [k.LATERAL_ERROR, k.HEADING_ERROR, k.SPEED_ERROR]]
@@ -181,7 +198,3 @@ def band_scores(trace: Array, path: ReferencePath, env: PathTrackingEnv) -> dict
         parts = np.sqrt(sums / np.maximum(count, 1)[:, None])
         found[name] = np.where(count > 0, parts.sum(axis=1), np.nan)
     return found
-
-
-KEPT = 1e-3
-"""A constraint broken by no more than this counts as kept, as in `experiments.run.metrics`."""

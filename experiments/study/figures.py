@@ -14,7 +14,7 @@ from experiments.run.metrics import BANDS
 from experiments.run.statistics import Interval
 from experiments.study.evaluation import EvaluationSet, loop_with
 from experiments.study.study import Study
-from experiments.study.tables import Judged
+from experiments.study.tables import RungResult
 from experiments.tuning.loop import WEIGHTS
 from experiments.tuning.tuner import Result
 from lpv_track_env.vector_env import PathTrackingVectorEnv
@@ -23,13 +23,14 @@ from trajectories import CurvatureBands
 Array = NDArray[Any]
 
 GROUPS = {"speed": (0, 4), "heading": (1, 5), "position": (2, 3, 6, 7)}
-"""Indices of Q and S by what they weigh."""
+"""Indices of the weights in Q and S of each quantity."""
 WINDOWS = 40
+"""Windows of a drive whose weights are drawn, each of 8 periods."""
 HEIGHT = 230.0
 
 
 def learning_curves(study: Study, styles: Styles) -> list[Panel]:
-    """Scores of what was tried over solves, mean over trainings."""
+    """Draw the scores of the candidates over the solves, mean over trainings."""
     curves = {}
     for label in styles:
         runs = [lines for seed in study.seeds if (lines := study.progress(label, seed))]
@@ -54,8 +55,8 @@ def learning_curves(study: Study, styles: Styles) -> list[Panel]:
     return [Panel("mean over trainings", chart.svg())]
 
 
-def regret(rows: Sequence[Judged], greedy: float, styles: Styles) -> list[Panel]:
-    """Score above the greedy oracle's against the solves that it took, 95 % intervals."""
+def regret(rows: Sequence[RungResult], greedy: float, styles: Styles) -> list[Panel]:
+    """Draw the score above the greedy oracle's over the solves, with 95 % intervals."""
     ends = [[row.score.low - greedy, row.score.high - greedy] for row in rows]
     solves = [row.solves for row in rows if row.solves > 0.0]
     chart = Chart(
@@ -69,14 +70,14 @@ def regret(rows: Sequence[Judged], greedy: float, styles: Styles) -> list[Panel]
         if row.solves == 0.0:
             chart.rule(y=value, kind=style.kind)
             continue
-        # Side by side, where budgets are the same.
+        # Rungs of one budget stand side by side.
         place = row.solves * 1.08 ** (k - 0.5 * len(rows))
         chart.interval(place, (row.score.low - greedy, value, row.score.high - greedy), style)
     return [Panel("95 % intervals", chart.svg())]
 
 
 def gains_in_bands(every: Mapping[str, Mapping[str, Interval]], styles: Styles) -> list[Panel]:
-    """Gains over the best fixed set in each band of curvature, 95 % intervals."""
+    """Draw the gains over the best fixed set in each band of curvature, with 95 % intervals."""
     ends = [
         [100 * gain.low, 100 * gain.high] for gains in every.values() for gain in gains.values()
     ]
@@ -103,7 +104,7 @@ def _offset(k: int, count: int) -> float:
 
 
 def weights_in_use(result: Result, given: EvaluationSet) -> tuple[Array, Array]:
-    """Weights (m, 10) and bands (m,) of the windows of some drives."""
+    """Return the weights (m, 10) and bands (m,) of the windows of some drives."""
     settings: dict[str, Any] = {"autoreset_mode": "Disabled", **given.env_settings}
     used, bands = [], []
     for path in given.trajectories[:6]:
@@ -123,7 +124,7 @@ def weights_in_use(result: Result, given: EvaluationSet) -> tuple[Array, Array]:
 def weights_over_curvature(
     study: Study, labels: Sequence[str], given: EvaluationSet, styles: Styles
 ) -> list[Panel]:
-    """Factors on the default weights in each band, medians and quartiles; a panel a group."""
+    """Draw the factors on the default weights in each band: medians, quartiles, a panel a group."""
     base = TrackingWeights().as_array()
     found = {
         label: weights_in_use(load(study.training(label, study.seeds[0]) / WEIGHTS), given)

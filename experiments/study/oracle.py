@@ -1,14 +1,15 @@
-"""How much there is to be gained at all: weights chosen by somebody who knows what will happen.
+"""Oracles: how much could be gained by weights that are chosen with knowledge of the drive.
 
-A pool of sets of weights is driven on all drives. Whoever knows the drive, the path or the
-conditions may take the best set for it; that against the best set for all is the headroom. Two
-figures of each: in hindsight (chosen on the drives that are scored: an upper bound, luck included)
-and by foresight (chosen on the drives of other seeds). A greedy oracle may change the set every
-window, and looks a few windows ahead on a copy of the drive, disturbances included.
+A pool of sets of weights is driven on all drives. An oracle that knows the path, the conditions or
+the drive takes the best set for it; the headroom is its gain over the best single set. Each has two
+figures: in hindsight, chosen on the drives that are scored, an upper bound that includes luck; and
+by foresight, chosen on the drives of other seeds. A greedy oracle may change the set in every
+window: it looks a few windows ahead on a copy of the drive, disturbances included.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,34 +19,97 @@ from scipy.stats import qmc
 import agents
 from agents.weight_tuning.choice import DIRECTIONS, SLEW
 from agents.weight_tuning.closed_loop import ClosedLoop, Tally
+from agents.weight_tuning.policy import load
 from agents.weight_tuning.score import failed, parts_of, scores_of
-from agents.weights import HIGHEST, LOWEST, TrackingWeights
+from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
 from experiments.study.evaluation import EvaluationSet
-from experiments.tuning.drives import threads, weights_at
+from experiments.study.study import Study
+from experiments.tuning.loop import WEIGHTS
+from experiments.tuning.tuner import threads, weights_at
 from lpv_track_env import kernels as k
 from lpv_track_env.conditions import layout
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import CurvatureBands
+from trajectories.fileio import write_atomically
 
 Array = NDArray[Any]
 
+FILE = "oracle.json"
 SPAN = 100.0
-"""Largest factor on a default weight in the pool: the tunings' own."""
+"""Largest factor on a default weight in the pool, as in the tunings."""
+POOL, QUICK_POOL = 64, 4
+"""Sets drawn for the pool; powers of two, for the Sobol sequence."""
+BRANCHES, QUICK_BRANCHES = 12, 3
+"""Sets that the greedy oracle tries in every window."""
 KNOWN = (layout.GNSS_NOISE, layout.STEERING_LAG, layout.STEERING_DEAD_TIME)
-"""Conditions that cells are made of, each divided at its median."""
+"""Conditions that an oracle may know, each as high or low against its median."""
+
+Follow = Callable[[str, Iterator[tuple[int, int]]], None]
+"""Runs an iterator over (done, all), showing its progress under a name."""
+
+
+def study_oracles(
+    study: Study, *, quick: bool, follow: Follow
+) -> tuple[list["Headroom"], float | None]:
+    """Compute the headroom of a study's first set and the greedy oracle's score.
+
+    Both are kept in the study's folder and read from there the next time.
+    """
+    file = study.folder / FILE
+    if file.exists():
+        kept = json.loads(file.read_text())
+        return [Headroom(**row) for row in kept["headroom"]], kept["greedy"]
+    given = study.sets[0]
+    found = [
+        result.weights[0]
+        for rung, seed in study.trainings()
+        if rung.method == "search"
+        and isinstance(result := load(study.training(rung.label, seed) / WEIGHTS), WeightSchedule)
+    ]
+    pool = pool_of(QUICK_POOL if quick else POOL, found)
+    scores: list[Array] = []
+    known: list[Array] = []
+
+    def pooled() -> Iterator[tuple[int, int]]:
+        for path_scores, path_known in scores_of_pool(given, pool):
+            scores.append(path_scores)
+            known.append(path_known)
+            yield len(scores), len(given.trajectories)
+
+    follow("oracle: every set on every drive", pooled())
+    table = np.stack(scores)
+    rows = headroom(table, np.stack(known))
+    greedy_scores: list[Array] = []
+    # A few drives a path: each tries many sets in every window.
+    few = replace(given, seeds=min(given.seeds, 2))
+    some = pool[varied(table, QUICK_BRANCHES if quick else BRANCHES)]
+
+    def greedily() -> Iterator[tuple[int, int]]:
+        for path_scores in greedy(few, some):
+            greedy_scores.append(path_scores)
+            yield len(greedy_scores), len(given.trajectories)
+
+    follow("oracle: greedy, every window", greedily())
+    best = table.mean(axis=(0, 2)).argmin()
+    # The ratio to the best fixed set on the greedy oracle's few drives, scaled to all drives.
+    share = np.mean(greedy_scores) / table[:, best, : few.seeds].mean()
+    value = float(rows[0].hindsight * share)
+    content = {"headroom": [vars(row) for row in rows], "greedy": value}
+    write_atomically(file, json.dumps(content, indent=2).encode())
+    return rows, value
 
 
 def pool_of(count: int, found: Sequence[TrackingWeights], seed: int = 0) -> Array:
-    """Sets of weights (sets, 10): those found, and a Sobol sequence over the span around default.
+    """Return sets of weights (sets, 10): default, those found, and a Sobol sequence over the span.
 
     Parameters
     ----------
     count
-        Of the sequence, a power of two.
+        Length of the sequence, a power of two.
     found
-        Sets that tunings have come to.
+        Results of tunings.
     seed
-        Of the sequence's scrambling.
+        Seed of the sequence's scrambling.
     """
     limit = np.log(SPAN)
     points = qmc.Sobol(DIRECTIONS["stages"].shape[1], seed=seed).random(count)
@@ -57,7 +121,7 @@ def pool_of(count: int, found: Sequence[TrackingWeights], seed: int = 0) -> Arra
 
 
 def loop_of(envs: PathTrackingVectorEnv) -> ClosedLoop:
-    """Closed loop of environments, with the tuner's slew limit."""
+    """Return the closed loop of environments, with the tuner's slew limit."""
     agent: Any = agents.make("lpv-nmpc", envs.single)
     return ClosedLoop(
         envs, agent, bands=CurvatureBands(), slew=SLEW, threads=min(threads(), envs.num_envs)
@@ -65,7 +129,7 @@ def loop_of(envs: PathTrackingVectorEnv) -> ClosedLoop:
 
 
 def scores_of_pool(given: EvaluationSet, pool: Array) -> Iterator[tuple[Array, Array]]:
-    """Scores (sets, seeds) and known conditions (seeds, 3) of each path of a set, in turns."""
+    """Yield scores (sets, seeds) and known conditions (seeds, 3) of each path of a set."""
     for path in given.trajectories:
         envs = PathTrackingVectorEnv(
             given.seeds, path, given.vehicle, conditions=given.conditions,
@@ -84,54 +148,56 @@ def scores_of_pool(given: EvaluationSet, pool: Array) -> Iterator[tuple[Array, A
 
 @dataclass(frozen=True)
 class Headroom:
-    """Mean scores of choices by what is known, and how far they are below the best fixed set's."""
+    """Mean scores of an oracle with some knowledge; None where there is no foresight."""
 
     knows: str
     hindsight: float
     foresight: float | None
 
     def gain(self, fixed: float) -> float:
-        """Share of the best fixed set's score, in hindsight."""
+        """Return the gain in hindsight, as a share of the best fixed set's score."""
         return 1.0 - self.hindsight / fixed
 
 
 def headroom(scores: Array, known: Array) -> list[Headroom]:
-    """Headroom of knowing path, conditions, or the drive itself; the first is the best fixed set.
+    """Return the headroom of knowing path, conditions, or the drive itself.
+
+    The first row is the best fixed set.
 
     Parameters
     ----------
     scores
-        (paths, sets, seeds).
+        Scores of the pool, (paths, sets, seeds).
     known
-        (paths, seeds, 3) conditions.
+        Conditions `KNOWN` of the drives, (paths, seeds, 3).
     """
     paths, _, seeds = scores.shape
     cells = ((known > np.median(known, axis=(0, 1))) @ (1 << np.arange(known.shape[2]))).astype(int)
-    rows, columns = np.indices((paths, seeds))
+    path, seed = np.indices((paths, seeds))
     groups = {
         "nothing": np.zeros((paths, seeds), dtype=int),
-        "the path": rows,
+        "the path": path,
         "noise, lag and dead time, each high or low": cells,
-        "the drive, disturbances included": rows * seeds + columns,
+        "the drive, disturbances included": path * seeds + seed,
     }
-    every, odd = np.ones((paths, seeds), dtype=np.bool_), columns % 2 == 1
-    told = []
+    every, odd = np.ones((paths, seeds), dtype=np.bool_), seed % 2 == 1
+    rows = []
     for name, group in groups.items():
         found = _chosen(scores, group, every, every) / (paths * seeds)
         ahead = None
-        # One seed leaves none to choose on, and a drive by itself none like it.
+        # Foresight chooses on drives of other seeds in the same group, if there are any.
         if seeds > 1 and len(np.unique(group)) < paths * seeds:
             ahead = (_chosen(scores, group, odd, ~odd) + _chosen(scores, group, ~odd, odd)) / (
                 paths * seeds
             )
-        told.append(Headroom(name, found, ahead))
-    return told
+        rows.append(Headroom(name, found, ahead))
+    return rows
 
 
 def _chosen(scores: Array, group: Array, chosen_on: Array, scored_on: Array) -> float:
-    """Sum of scores where every group takes the set that is best on some drives, on others.
+    """Return the sum of scores on `scored_on`, with the set of each group chosen on `chosen_on`.
 
-    A group with none to choose on takes the set that is best for all.
+    A group without drives to choose on takes the set that is best for all.
     """
     total = 0.0
     by_drive = scores.transpose(0, 2, 1)
@@ -143,9 +209,9 @@ def _chosen(scores: Array, group: Array, chosen_on: Array, scored_on: Array) -> 
 
 
 def varied(scores: Array, count: int) -> list[int]:
-    """Sets of a pool that together leave least to be wished, chosen one after another.
+    """Choose sets of a pool one after another, each to lower the mean of the best scores most.
 
-    `scores` is (paths, sets, seeds); the first is the best for all.
+    `scores` is (paths, sets, seeds); the first choice is the best set for all drives.
     """
     table = scores.transpose(1, 0, 2).reshape(scores.shape[1], -1)
     kept: list[int] = []
@@ -161,7 +227,7 @@ def varied(scores: Array, count: int) -> list[int]:
 def greedy(
     given: EvaluationSet, pool: Array, *, window: int = 8, ahead: int = 3
 ) -> Iterator[Array]:
-    """Scores (seeds,) of a greedy oracle on each path of a set, in turns.
+    """Yield scores (seeds,) of a greedy oracle on each path of a set.
 
     Every `window` periods it tries each set of the pool (sets, 10) over `ahead` windows on a copy
     of the drive, and takes the best one for one window.
@@ -183,7 +249,7 @@ def greedy(
         while running.any():
             loop.copy(np.repeat(main, count), branches)
             ends = envs.arrays.ends
-            # The main ones stand still meanwhile.
+            # The main drives stand still meanwhile.
             kept = ends[:n].copy()
             ends[:n] = k.TIME_LIMIT
             tally = loop.drive(window * ahead, tables)
@@ -193,7 +259,7 @@ def greedy(
             best = cost[n:].reshape(n, count).argmin(axis=1)
             tables[:n] = pool[best]
             ends[n:] = k.TIME_LIMIT
-            # Of the sums the score reads squares and steps alone; peaks among them mean nothing.
+            # The score reads squares and steps only: summed peaks have no meaning.
             sums += np.array(loop.drive(window, tables))[:, :n]
             running = loop.running[:n]
         yield scores_of(Tally(*sums), envs.arrays.ends[:n])

@@ -1,4 +1,4 @@
-"""The tuning study's report: one page, with everything that its figures can be checked by."""
+"""Report of the tuning study: one page, with everything needed to check its figures."""
 
 import html
 import json
@@ -15,12 +15,11 @@ from experiments.report.page import (
     paragraph,
 )
 from experiments.run.metrics import BANDS
-from experiments.run.provenance import hardware, revision, versions
+from experiments.run.provenance import provenance
 from experiments.run.statistics import Interval
 from experiments.study import figures, tables
-from experiments.study.ladder import BASELINE, OURS, PPO
 from experiments.study.oracle import Headroom
-from experiments.study.study import Study
+from experiments.study.study import BASELINE, OURS, PPO, Study
 from trajectories.fileio import write_atomically
 
 FORMULA = (
@@ -33,9 +32,12 @@ FORMULA = (
 def write_report(
     study: Study, headroom: list[Headroom], greedy: float | None, file: Path
 ) -> dict[str, Any]:
-    """Write the page and, beside it, `summary.json`; what the summary holds."""
+    """Write the page and `summary.json` beside it; return the content of the summary."""
     main = study.sets[0].name
-    rows = [tables.judged(study, main, label) for label in tables.shown(study)]
+    rows = [
+        tables.rung_result(study, main, label)
+        for label in tables.labels_under(study, disturbed=True)
+    ]
     gain = None if greedy is None else 1.0 - greedy / headroom[0].hindsight
     page = Document()
     page.section("Score", paragraph(f"{FORMULA}."))
@@ -54,13 +56,13 @@ def write_report(
                 ),
             ),
         )
-    if alone := tables.curvature_alone(study):
+    if alone := tables.labels_under(study, disturbed=False):
         name = next(one.name for one in study.sets if one.conditions == "simulation")
-        judged = [tables.judged(study, name, one) for one in alone]
+        undisturbed = [tables.rung_result(study, name, label) for label in alone]
         page.section(
             f"Curvature alone: {name}",
             paragraph("Tuned and judged without disturbances: nothing differs but the path.")
-            + _ladder(page, name, judged, None),
+            + _ladder(page, name, undisturbed, None),
         )
     headings, lines = tables.sets_lines(study, study.labels)
     page.section(
@@ -78,7 +80,7 @@ def write_report(
              "conditions": one.conditions}
             for one in study.sets
         ],
-        "versions": versions(), "revision": revision(), "hardware": hardware(),
+        **provenance(),
     }  # fmt: skip
     page.section(
         "Manifest", f'<pre tabindex="0">{html.escape(json.dumps(manifest, indent=2))}</pre>'
@@ -90,17 +92,17 @@ def write_report(
         **manifest,
         "headroom": [vars(row) for row in headroom],
         "greedy": greedy,
-        "ladder": tables.ladder_lines(rows, gain),
+        "ladder": tables.rung_lines(rows, gain),
     }
     write_atomically(file.with_name("summary.json"), json.dumps(summary, indent=2).encode())
     return summary
 
 
-def _ladder(page: Document, name: str, rows: list[tables.Judged], gain: float | None) -> str:
-    """What the rungs are, and how they were judged: prose apart, so that numbers stand in a row."""
+def _ladder(page: Document, name: str, rows: list[tables.RungResult], gain: float | None) -> str:
+    """Return the table of the rungs' results, and one of what the rungs are."""
     words = [[row.rung.label, row.rung.words] for row in rows]
-    headings = tables.LADDER_HEADINGS
-    lines = tables.ladder_lines(rows, gain)
+    headings = tables.RUNG_HEADINGS
+    lines = tables.rung_lines(rows, gain)
     prose = headings.index("what it is")
     return joined(
         [
@@ -144,7 +146,7 @@ def _headroom(page: Document, rows: list[Headroom], greedy: float | None) -> str
 def _figures(
     page: Document,
     study: Study,
-    rows: list[tables.Judged],
+    rows: list[tables.RungResult],
     greedy: float | None,
     gains: Mapping[str, Mapping[str, Interval]],
 ) -> str:

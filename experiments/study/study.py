@@ -1,7 +1,8 @@
-"""The tuning study: every rung of the ladder, trained for several seeds, judged on the same drives.
+"""The tuning study: every rung trained for several seeds and evaluated on the same drives.
 
-A folder holds all of it: `trainings/LABEL-SEED/` as `lpv-track tune` leaves them, and
-`judged/SET/LABEL-SEED.npz`; what is there is not made again, so a study goes on where it stopped.
+A rung is a way to tune weights: a method, its budget, its view and its conditions. The folder of a
+study holds `trainings/LABEL-SEED/` as `lpv-track tune` leaves them, and `judged/SET/LABEL-SEED.npz`
+with the evaluation of each. Only what is missing is made, so a study resumes where it stopped.
 """
 
 import io
@@ -17,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.weight_tuning.policy import load
+from experiments.jobs.job import PROGRESS, Line, Listener, read_lines
 from experiments.run.engines import local_pool
-from experiments.study.evaluation import FIGURES, EvaluationSet, Judge
-from experiments.study.ladder import EVERY, Rung, rung
-from experiments.tuning.loop import PROGRESS, WEIGHTS, Listener, tune
+from experiments.study.evaluation import FIGURES, EvaluationSet, Evaluator
+from experiments.tuning.loop import WEIGHTS, tune
+from experiments.tuning.settings import TuningSettings, usual
 from trajectories.fileio import write_atomically
 from trajectories.naming import choose
 
@@ -28,11 +30,100 @@ Array = NDArray[Any]
 Figures = dict[str, Array]
 
 SETTINGS = "study.json"
+BLOCK = 12
+"""Trainings that a worker evaluates in one go: making the environments takes as long as several."""
+
+# Rungs --------------------------------------------------------------------------------------------
+
+BASELINE = "search x10"
+"""Label of the best fixed set at ten times the others' budget, which gains are relative to."""
+OURS = "paired"
+"""Label of the project's own method."""
+PPO = "rl"
+"""Label of PPO from a library."""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A way to tune weights; its budget is `factor` times that of the study."""
+
+    label: str
+    method: str
+    words: str
+    factor: int = 1
+    view: str = "all"
+    conditions: str = "randomised"
+
+    @property
+    def by_path(self) -> bool:
+        """True if a set is chosen once for a path."""
+        return self.method == "paper"
+
+    @property
+    def baseline(self) -> str:
+        """Label of the rung it is compared with: the best fixed set under the same conditions."""
+        return f"{BASELINE}, simulation" if self.conditions == "simulation" else BASELINE
+
+    def settings(self, seed: int, solves: int) -> TuningSettings:
+        """Return the settings of a training."""
+        return usual(
+            self.method, seed=seed, solves=self.factor * solves, view=self.view,
+            conditions=self.conditions,
+        )  # fmt: skip
+
+    def command(self, seed: int, solves: int) -> str:
+        """Return the command that makes the same weights."""
+        words = ["lpv-track", "tune", "--method", self.method]
+        words += ["--solves", str(self.factor * solves), "--seed", str(seed)]
+        return " ".join([*words, "--view", self.view, "--conditions", self.conditions])
+
+
+RUNGS: tuple[Rung, ...] = (
+    Rung("default", "fixed", "default weights"),
+    Rung("paper", "paper", "a set by the path's sharpest curvature, searched"),
+    Rung("search", "search", "best fixed set, CMA-ES"),
+    Rung(BASELINE, "search", "the same at ten times the budget", factor=10),
+    Rung("bands", "bands", "a set a band, CMA-ES"),
+    Rung("gradient", "gradient", "a set a band, gradients of the closed loop"),
+    Rung("catalogue", "catalogue", "PPO chooses of 25 sets"),
+    Rung(PPO, "rl", "PPO multiplies weights"),
+    Rung(OURS, "paired", "a linear policy multiplies weights, learned from pairs of drives"),
+    Rung("paired, path", "paired", "the same, shown curvature alone", view="path"),
+    Rung("paired, drive", "paired", "the same, shown the drive's history alone", view="drive"),
+    # Without disturbances, drives differ in the curvature of the path alone.
+    Rung(f"{BASELINE}, simulation", "search", "best fixed set without disturbances", 10,
+         conditions="simulation"),
+    Rung("bands, simulation", "bands", "a set a band without disturbances",
+         conditions="simulation"),
+    Rung("rl, simulation", "rl", "PPO shown curvature alone, without disturbances", view="path",
+         conditions="simulation"),
+    Rung("paired, simulation", "paired", "a linear policy shown curvature alone, without them",
+         view="path", conditions="simulation"),
+)  # fmt: skip
+
+
+def rung_of(label: str) -> Rung:
+    """Return the rung with a label."""
+    return next(rung for rung in RUNGS if rung.label == label)
+
+
+def checked_labels(labels: Sequence[str]) -> tuple[str, ...]:
+    """Return labels of rungs, all of them known.
+
+    Raises
+    ------
+    ValueError
+        Naming the one that is not.
+    """
+    return tuple(choose("rung", label, tuple(rung.label for rung in RUNGS)) for label in labels)
+
+
+# The study's folder -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Study:
-    """What a study makes: trainings of `labels` for `seeds`, each of `solves` times its factor."""
+    """A study: trainings of `labels` for `seeds`, each of `solves` times the rung's factor."""
 
     folder: Path
     labels: tuple[str, ...]
@@ -41,7 +132,7 @@ class Study:
     sets: tuple[EvaluationSet, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """What decides what the trainings and their judgements are, in plain JSON."""
+        """Return all that determines the trainings and evaluations, in plain JSON."""
         return {
             "solves": self.solves,
             "sets": {
@@ -56,7 +147,7 @@ class Study:
         Raises
         ------
         ValueError
-            If it holds one of another budget, or other drives to judge on.
+            If it holds a study with another budget or other drives.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         file, own = self.folder / SETTINGS, self.as_dict()
@@ -74,49 +165,48 @@ class Study:
         write_atomically(file, json.dumps(own, indent=2).encode())
 
     def training(self, label: str, seed: int) -> Path:
-        """Folder of a training."""
-        return self.folder / "trainings" / f"{plain(label)}-{seed}"
+        """Return the folder of a training."""
+        return self.folder / "trainings" / f"{file_name(label)}-{seed}"
 
-    def judged(self, name: str, label: str, seed: int) -> Path:
-        """File of what a training was judged on a set."""
-        return self.folder / "judged" / plain(name) / f"{plain(label)}-{seed}.npz"
+    def evaluation(self, name: str, label: str, seed: int) -> Path:
+        """Return the file of a training's evaluation on a set."""
+        return self.folder / "judged" / file_name(name) / f"{file_name(label)}-{seed}.npz"
 
     def trainings(self) -> list[tuple[Rung, int]]:
-        """All of them, the longest first so that a pool ends evenly."""
-        rungs = sorted((rung(label) for label in self.labels), key=lambda one: -one.factor)
-        # The default weights are the same for every seed.
-        return [
-            (one, seed)
-            for one in rungs
-            for seed in (self.seeds[:1] if one.method == "fixed" else self.seeds)
-        ]
+        """Return all trainings, the longest first so that a pool ends evenly."""
+        rungs = sorted((rung_of(label) for label in self.labels), key=lambda rung: -rung.factor)
+        return [(rung, seed) for rung in rungs for seed in self._seeds_of(rung)]
+
+    def _seeds_of(self, rung: Rung) -> tuple[int, ...]:
+        """Return the seeds of a rung: the default weights are the same for every seed."""
+        return self.seeds[:1] if rung.method == "fixed" else self.seeds
 
     def read(self, name: str, label: str) -> dict[str, Array]:
-        """Figures of a rung on a set, (trainings, paths, drives) each."""
-        seeds = self.seeds[:1] if rung(label).method == "fixed" else self.seeds
-        every = [read_figures(self.judged(name, label, seed)) for seed in seeds]
+        """Read the figures of a rung on a set, (trainings, paths, drives) each."""
+        every = [
+            read_figures(self.evaluation(name, label, seed))
+            for seed in self._seeds_of(rung_of(label))
+        ]
         return {key: np.stack([one[key] for one in every]) for key in FIGURES}
 
-    def progress(self, label: str, seed: int) -> list[dict[str, Any]]:
-        """Lines of a training's `progress.jsonl`; none for the default weights."""
-        file = self.training(label, seed) / PROGRESS
-        if not file.exists():
-            return []
-        return [json.loads(line) for line in file.read_text().splitlines()]
+    def progress(self, label: str, seed: int) -> list[Line]:
+        """Read the lines of a training's progress; none for the default weights."""
+        folder = self.training(label, seed)
+        return read_lines(folder) if (folder / PROGRESS).exists() else []
 
 
-def plain(name: str) -> str:
-    """A name as a file's."""
+def file_name(name: str) -> str:
+    """Return a name without commas and spaces."""
     return name.replace(", ", "-").replace(" ", "-")
 
 
 def read_figures(file: Path) -> Figures:
-    """Figures of a file, (paths, drives) each.
+    """Read the figures of a file, (paths, drives) each.
 
     Raises
     ------
     ValueError
-        In one line, if it cannot be used.
+        In one line, if the file cannot be used.
     """
     try:
         with np.load(file, allow_pickle=False) as content:
@@ -129,82 +219,62 @@ def read_figures(file: Path) -> Figures:
 
 
 def write_figures(file: Path, figures: Figures) -> None:
-    """Write figures, atomically."""
+    """Write figures atomically."""
     buffer = io.BytesIO()
     named: Any = {name: figures[name] for name in FIGURES}
     np.savez_compressed(buffer, **named)
-    file.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(file, buffer.getvalue())
 
 
+# Trainings and evaluations ------------------------------------------------------------------------
+
+
 def train_one(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Train one rung for one seed, or go on with it; for a pool of processes."""
-    folder = Path(spec["folder"])
-    settings = rung(spec["label"]).settings(spec["seed"], spec["solves"])
-    listener = Listener(lambda *_: None, lambda _: None)
-    tune(settings, folder, listener, command=spec["command"])
+    """Train one rung for one seed, or resume it; for a pool of processes."""
+    settings = rung_of(spec["label"]).settings(spec["seed"], spec["solves"])
+    tune(settings, Path(spec["folder"]), Listener(), command=spec["command"])
     return {"label": spec["label"], "seed": spec["seed"]}
 
 
-def judge_one(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Judge all trainings of a set that are not yet judged; for a pool of processes."""
+def evaluate_one(spec: Mapping[str, Any]) -> dict[str, Any]:
+    """Evaluate a block of trainings on a set; for a pool of processes."""
     given: EvaluationSet = spec["set"]
-    judge = Judge(given)
+    evaluator = Evaluator(given)
     for label, weights, file in spec["todo"]:
-        figures = judge.judge(load(Path(weights)), by_path=rung(label).by_path)
+        figures = evaluator.evaluate(load(Path(weights)), by_path=rung_of(label).by_path)
         write_figures(Path(file), figures)
     return {"set": given.name}
 
 
 def run_trainings(study: Study, workers: int) -> Iterator[tuple[int, int]]:
-    """Make what trainings are missing; (done, all) after each."""
-    wanted = [
-        (one, seed)
-        for one, seed in study.trainings()
-        if not (study.training(one.label, seed) / WEIGHTS).exists()
-    ]
+    """Run the missing trainings; yields (done, all) after each."""
     specs = [
         {
-            "folder": str(study.training(one.label, seed)), "label": one.label, "seed": seed,
-            "solves": study.solves, "command": one.command(seed, study.solves),
+            "folder": str(folder), "label": rung.label, "seed": seed, "solves": study.solves,
+            "command": rung.command(seed, study.solves),
         }
-        for one, seed in wanted
+        for rung, seed in study.trainings()
+        if not ((folder := study.training(rung.label, seed)) / WEIGHTS).exists()
     ]  # fmt: skip
     yield 0, len(specs)
     for k, _ in enumerate(local_pool(specs, workers, run=train_one, died=_died)):
         yield k + 1, len(specs)
 
 
-def run_judging(study: Study, workers: int) -> Iterator[tuple[int, int]]:
-    """Judge what is not yet judged; (done, all) after each block."""
+def run_evaluations(study: Study, workers: int) -> Iterator[tuple[int, int]]:
+    """Run the missing evaluations; yields (done, all) after each block."""
     specs = []
     for given in study.sets:
         todo = [
-            (one.label, str(study.training(one.label, seed) / WEIGHTS), str(file))
-            for one, seed in study.trainings()
-            if not (file := study.judged(given.name, one.label, seed)).exists()
+            (rung.label, str(study.training(rung.label, seed) / WEIGHTS), str(file))
+            for rung, seed in study.trainings()
+            if not (file := study.evaluation(given.name, rung.label, seed)).exists()
         ]
-        # A block takes as long as making its environments, several times over.
         specs += [{"set": given, "todo": todo[k : k + BLOCK]} for k in range(0, len(todo), BLOCK)]
     yield 0, len(specs)
-    for k, _ in enumerate(local_pool(specs, workers, run=judge_one, died=_died)):
+    for k, _ in enumerate(local_pool(specs, workers, run=evaluate_one, died=_died)):
         yield k + 1, len(specs)
-
-
-BLOCK = 12
-"""Trainings judged in one go."""
 
 
 def _died(spec: Mapping[str, Any]) -> dict[str, Any]:
     raise RuntimeError(f"a worker died, twice, over {spec.get('label') or spec['set'].name}")
-
-
-def checked_labels(labels: Sequence[str]) -> tuple[str, ...]:
-    """Labels of rungs, all known.
-
-    Raises
-    ------
-    ValueError
-        Naming the one that is not.
-    """
-    return tuple(choose("rung", label, tuple(one.label for one in EVERY)) for label in labels)

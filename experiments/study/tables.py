@@ -1,4 +1,4 @@
-"""What the tuning study says in tables: rows of plain text cells, for page and terminal."""
+"""Tables of the tuning study: rows of plain text cells, for the page and the terminal."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,17 +17,16 @@ from experiments.run.statistics import (
     rate_bound,
 )
 from experiments.study.evaluation import IN_BANDS
-from experiments.study.ladder import Rung, baseline_of, rung
 from experiments.study.oracle import Headroom
-from experiments.study.study import Study
+from experiments.study.study import Rung, Study, rung_of
 
 Array = NDArray[Any]
 Lines = list[list[str]]
 
 
 @dataclass(frozen=True)
-class Judged:
-    """A rung on an evaluation set."""
+class RungResult:
+    """Results of a rung on an evaluation set: means, interquartile where there are trainings."""
 
     rung: Rung
     solves: float
@@ -36,26 +35,24 @@ class Judged:
     tracking: float
     comfort: float
     gain: Interval | None
-    """Over the best fixed set; None for that itself and what has no equal number of trainings."""
+    """Gain over the best fixed set; None for that set itself."""
     failures: int
     drives: int
     violated: float
 
 
-def judged(study: Study, name: str, label: str) -> Judged:
-    """A rung of a study on one of its sets."""
-    figures, one = study.read(name, label), rung(label)
+def rung_result(study: Study, name: str, label: str) -> RungResult:
+    """Return the results of a rung on one of the study's sets."""
+    figures, rung = study.read(name, label), rung_of(label)
     parts = np.stack([figures[part] for part in PARTS], axis=-1).mean(axis=(1, 2))
     ends = [lines[-1] for seed in study.seeds if (lines := study.progress(label, seed))]
-    reference = baseline_of(one)
     gain = None
-    if label != reference and reference in study.labels:
-        base = study.read(name, reference)["score"]
-        # The default weights are one training; it is compared with each.
-        ours = np.broadcast_to(figures["score"], base.shape)
-        gain = paired_gain(ours, base)
-    return Judged(
-        rung=one,
+    if label != rung.baseline and rung.baseline in study.labels:
+        base = study.read(name, rung.baseline)["score"]
+        # The default weights are one training, compared with each of the baseline's.
+        gain = paired_gain(np.broadcast_to(figures["score"], base.shape), base)
+    return RungResult(
+        rung=rung,
         solves=float(np.mean([end["solves"] for end in ends])) if ends else 0.0,
         seconds=float(np.mean([end["seconds"] for end in ends])) if ends else 0.0,
         score=mean_interval(figures["score"]),
@@ -68,15 +65,14 @@ def judged(study: Study, name: str, label: str) -> Judged:
     )
 
 
-LADDER_HEADINGS = (
+RUNG_HEADINGS = (
     "rung", "what it is", "solves", "s", "score", "95 %", "tracking", "comfort",
     "gain", "95 %", "of the headroom", "failed", "at most", "violations",
 )  # fmt: skip
-NUMERIC = tuple(range(2, len(LADDER_HEADINGS)))
 
 
-def ladder_lines(rows: Sequence[Judged], headroom: float | None) -> Lines:
-    """A line a rung; `headroom` is the greedy oracle's gain over the best fixed set."""
+def rung_lines(rows: Sequence[RungResult], headroom: float | None) -> Lines:
+    """Return a line for each rung; `headroom` is the greedy oracle's gain over the baseline."""
     lines = []
     for row in rows:
         gain = row.gain
@@ -110,7 +106,7 @@ HEADROOM_HEADINGS = (
 
 
 def headroom_lines(rows: Sequence[Headroom], greedy: float | None) -> Lines:
-    """A line a kind of knowledge; the first row is the best fixed set of the pool."""
+    """Return a line for each kind of knowledge; the first is the best fixed set of the pool."""
     fixed, ahead = rows[0].hindsight, rows[0].foresight
     lines = []
     for row in rows:
@@ -127,7 +123,7 @@ def headroom_lines(rows: Sequence[Headroom], greedy: float | None) -> Lines:
 
 
 def sets_lines(study: Study, labels: Sequence[str]) -> tuple[list[str], Lines]:
-    """Headings, and a line a rung: its score on every set, tracking and comfort."""
+    """Return headings, and a line for each rung with its score on every set."""
     headings = ["rung", *(given.name for given in study.sets)]
     lines = []
     for label in labels:
@@ -142,13 +138,13 @@ def sets_lines(study: Study, labels: Sequence[str]) -> tuple[list[str], Lines]:
 
 
 def band_gains(study: Study, name: str, label: str) -> dict[str, Interval]:
-    """Gains over the best fixed set on a set's drives, in each band that its paths have."""
-    ours, base = study.read(name, label), study.read(name, baseline_of(rung(label)))
+    """Return the gains over the best fixed set in each band that the paths of a set have."""
+    ours, base = study.read(name, label), study.read(name, rung_of(label).baseline)
     gains = {}
     for entry, band in zip(IN_BANDS, BANDS.names, strict=True):
         reference = base[entry]
         given = np.broadcast_to(ours[entry], reference.shape)
-        # Drives differ in how fast they fail, not in where they lead: a path has a band or not.
+        # A path counts in a band if every drive on it has periods there.
         whole = (np.isfinite(given) & np.isfinite(reference)).all(axis=(0, 2))
         if whole.any():
             gains[band] = paired_gain(given[:, whole], reference[:, whole])
@@ -156,7 +152,7 @@ def band_gains(study: Study, name: str, label: str) -> dict[str, Interval]:
 
 
 def band_lines(every: Mapping[str, Mapping[str, Interval]]) -> Lines:
-    """A line a rung: gains in each band."""
+    """Return a line for each rung with its gains in each band."""
     lines = []
     for label, gains in every.items():
         cells = [
@@ -173,7 +169,7 @@ PAPER_HEADINGS = ("path", "rung", "Max CTE m", "ALE m", "AOE rad", "score", "ste
 
 
 def paper_lines(study: Study, name: str, labels: Sequence[str]) -> Lines:
-    """The paper's terms of a set: a line a path and rung, means over trainings and drives."""
+    """Return the paper's metrics on a set: means over trainings and drives, by path and rung."""
     given = next(one for one in study.sets if one.name == name)
     found: Mapping[str, dict[str, Array]] = {label: study.read(name, label) for label in labels}
     lines = []
@@ -194,11 +190,8 @@ def paper_lines(study: Study, name: str, labels: Sequence[str]) -> Lines:
     return lines
 
 
-def shown(study: Study) -> list[str]:
-    """Labels of a study in the ladder's order, the best fixed set among them or not."""
-    return [label for label in study.labels if rung(label).conditions != "simulation"]
-
-
-def curvature_alone(study: Study) -> list[str]:
-    """Labels of what was tuned without disturbances."""
-    return [label for label in study.labels if rung(label).conditions == "simulation"]
+def labels_under(study: Study, *, disturbed: bool) -> list[str]:
+    """Return the labels of the rungs tuned with disturbances, or of those tuned without."""
+    return [
+        label for label in study.labels if (rung_of(label).conditions != "simulation") == disturbed
+    ]

@@ -1,11 +1,12 @@
 """Behaviour cloning of `lpv-nmpc` with DAgger (Ross, Gordon, Bagnell 2011).
 
-Round by round the environments are driven, some by the expert and the others by the policy as it
-is; the expert says at every step what it would do; and the network is fitted to all that it ever
-said, by least squares. Hyperparameters (`--set`): `learning_rate`, `last_learning_rate`; `round`
-steps of every environment, then `updates` of Adam with `batch` samples each; `expert_share` of the
-environments that the expert drives (all, in the first round), with uniform `noise` in [-1, 1] on
-what half of each drive; `hidden`, `activation`, `origin` as for PPO.
+In each round the expert drives some of the environments and the present policy the others. At
+every step the expert's action is recorded, and after the round the network is fitted by least
+squares to all actions recorded so far. Hyperparameters (`--set`): `learning_rate`,
+`last_learning_rate`; `round` steps of every environment, then `updates` of Adam with `batch`
+samples each; `expert_share` of the environments that the expert drives (all of them in the first
+round); `noise`, the amplitude of uniform noise on the actions in half of the environments;
+`hidden`, `activation`, `origin` as for PPO.
 """
 
 from collections.abc import Mapping
@@ -23,14 +24,13 @@ from agents.learned.learner import LearnerVecEnv
 from agents.learned.policy import Policy
 from agents.nmpc.rti_agent import RtiNmpc
 from experiments.training.settings import TrainingSettings
-from experiments.training.start import check_start, put_layers
-from experiments.training.trainer import MODULES, Tick, Trainer
+from experiments.training.trainer import MODULES, Tick, Trainer, check_start, put_layers
 
 Array = NDArray[Any]
 
 
 class CloningTrainer(Trainer):
-    """Rounds of driving, asking and fitting."""
+    """Rounds of driving, recording the expert's actions, and fitting."""
 
     def __init__(
         self, settings: TrainingSettings, env: LearnerVecEnv, start: Policy | None, logger: Logger
@@ -49,25 +49,25 @@ class CloningTrainer(Trainer):
             check_start(start, settings, env, squash="clip")
             put_layers(start.layers, self._linear)
         self._expert = RtiNmpc(env.task)
-        self._asked = np.zeros((0, env.scaling.features), dtype=np.float32)
-        self._said = np.zeros((0, 2), dtype=np.float32)
+        self._features = np.zeros((0, env.scaling.features), dtype=np.float32)
+        self._labels = np.zeros((0, 2), dtype=np.float32)
         self._optimiser = torch.optim.Adam(self._net.parameters(), lr=self.rate())
 
     @property
     def steps(self) -> int:
-        """Steps driven, each of them with the expert's answer."""
-        return len(self._asked)
+        """Environment steps so far, each with an action of the expert."""
+        return len(self._features)
 
     @property
     def solves(self) -> int:
-        """The expert's answers."""
-        return len(self._asked)
+        """Solves of the expert so far."""
+        return len(self._features)
 
     def segment(self, number: int, tick: Tick) -> dict[str, float]:
-        """Rounds up to the end of a segment."""
+        """Run rounds up to the end of a segment."""
         self.begin_segment(number)
         loss = 0.0
-        while self.steps < self.settings.of_segment(number):
+        while self.steps < self.settings.end_of(number):
             self._drive()
             loss = self._fit()
             self._logger.record("train/loss", loss)
@@ -77,26 +77,26 @@ class CloningTrainer(Trainer):
         return {"loss": loss}
 
     def _drive(self) -> None:
-        """One round: every environment begins anew and is driven for `round` steps."""
+        """Reset every environment and drive it for `round` steps."""
         n = self.env.num_envs
         features: Array = self.env.reset()
         memory, starts = None, np.ones(n, dtype=np.bool_)
         by_expert = self.random.random(n) < (1.0 if not self.steps else self.hyper["expert_share"])
         noise = self.hyper["noise"] * (self.random.random(n) < 0.5)
-        asked: list[Array] = [self._asked]
-        said: list[Array] = [self._said]
+        inputs: list[Array] = [self._features]
+        labels: list[Array] = [self._labels]
         for _ in range(self.hyper["round"]):
             actions, memory = self._expert.predict(self.env.agent_observations, memory, starts)
             scaling = self.env.scaling
             wanted = (actions - self.env.origins - scaling.centre) / scaling.half
             wanted = np.clip(wanted, -1.0, 1.0).astype(np.float32)
-            asked.append(features)
-            said.append(wanted)
+            inputs.append(features)
+            labels.append(wanted)
             outputs = np.where(by_expert[:, None], wanted, self._outputs(features))
             outputs += noise[:, None] * self.random.uniform(-1.0, 1.0, outputs.shape)
             self.env.step_async(outputs)
             features, _, starts, _ = self.env.step_wait()
-        self._asked, self._said = np.concatenate(asked), np.concatenate(said)
+        self._features, self._labels = np.concatenate(inputs), np.concatenate(labels)
 
     def _outputs(self, features: Array) -> Array:
         with torch.no_grad():
@@ -104,11 +104,11 @@ class CloningTrainer(Trainer):
         return outputs
 
     def _fit(self) -> float:
-        """Adam on samples of everything said so far; the mean loss of the last tenth."""
+        """Fit the network to all labels by Adam; return the mean loss of the last updates."""
         for group in self._optimiser.param_groups:
             group["lr"] = self.rate()
         inputs, targets = (
-            torch.from_numpy(values).to(self.device) for values in (self._asked, self._said)
+            torch.from_numpy(values).to(self.device) for values in (self._features, self._labels)
         )
         updates, losses = self.hyper["updates"], []
         for _ in range(updates):
@@ -121,22 +121,22 @@ class CloningTrainer(Trainer):
         return float(np.mean(losses[-max(updates // 10, 1) :]))
 
     def state(self) -> dict[str, Any]:
-        """Network, optimiser, and all that was asked and said."""
+        """Return the network, the optimiser, and all features and labels."""
         return {
             "network": self._net.state_dict(),
             "optimiser": self._optimiser.state_dict(),
-            "asked": torch.from_numpy(self._asked),
-            "said": torch.from_numpy(self._said),
+            "asked": torch.from_numpy(self._features),
+            "said": torch.from_numpy(self._labels),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take a state back."""
+        """Return to a state."""
         self._net.load_state_dict(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
-        self._asked, self._said = state["asked"].numpy(), state["said"].numpy()
+        self._features, self._labels = state["asked"].numpy(), state["said"].numpy()
 
     def policy(self, training: Mapping[str, Any]) -> Policy:
-        """The policy as it is."""
+        """Return the present policy."""
         scaling = self.env.scaling
         layers = tuple(
             (layer.weight.detach().cpu().numpy().copy(), layer.bias.detach().cpu().numpy().copy())

@@ -1,15 +1,15 @@
 """PPO, SAC, TD3 and the residual (PPO on top of the NMPC) by Stable-Baselines3.
 
-Hyperparameters (`--set`), beside the network's `hidden` widths and `activation` and what actions
-are additions to, `origin` ("zero", "actuators", "lpv-nmpc"):
+Hyperparameters (`--set`), besides the network's `hidden` widths and `activation` and the `origin`
+("zero", "actuators", "lpv-nmpc") that actions are added to:
 
 PPO (Schulman et al. 2017): `learning_rate`, `last_learning_rate`; `rollout` steps of every
 environment between updates, `epochs` over them in batches of `batch`; `discount`, `gae_lambda`,
 `clip_range`; `deviation` of the first policy's actions in [-1, 1].
 
 SAC (Haarnoja et al. 2018) and TD3 (Fujimoto et al. 2018): `buffer` transitions, `batch`,
-`gradient_steps` after every step of the environments, `learning_starts` steps before, `discount`,
-`target_rate` (tau); `noise` of TD3's actions.
+`gradient_steps` after every step of the environments, `learning_starts` steps before the first,
+`discount`, `target_rate` (tau); `noise` of TD3's actions.
 """
 
 from collections.abc import Mapping
@@ -26,15 +26,14 @@ from stable_baselines3.common.noise import NormalActionNoise
 from agents.learned.learner import LearnerVecEnv
 from agents.learned.policy import Policy
 from experiments.training.settings import TrainingSettings
-from experiments.training.start import check_start, put_layers
-from experiments.training.trainer import MODULES, Tick, Trainer
+from experiments.training.trainer import MODULES, Tick, Trainer, check_start, put_layers
 
 KEPT = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-"""Arrays of SB3's replay buffer."""
+"""Arrays of SB3's replay buffer that a checkpoint keeps."""
 
 
-class _Watch(BaseCallback):
-    """Tells how far a segment is."""
+class _Progress(BaseCallback):
+    """Reports the progress of a segment after every rollout."""
 
     def __init__(self, tick: Tick) -> None:
         super().__init__()
@@ -45,12 +44,12 @@ class _Watch(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         ended = self.model.ep_info_buffer
-        said = f"reward {np.mean([episode['r'] for episode in ended]):.1f}" if ended else ""
-        self._tick(self.model.num_timesteps, said)
+        words = f"reward {np.mean([episode['r'] for episode in ended]):.1f}" if ended else ""
+        self._tick(self.model.num_timesteps, words)
 
 
 class Sb3Trainer(Trainer):
-    """Segments of `learn`."""
+    """Training by calls of SB3's `learn`, one a segment."""
 
     def __init__(
         self, settings: TrainingSettings, env: LearnerVecEnv, start: Policy | None, logger: Logger
@@ -105,7 +104,7 @@ class Sb3Trainer(Trainer):
 
     @property
     def solves(self) -> int:
-        """NMPC solves so far, of the residual's base."""
+        """NMPC solves so far, by the residual's base."""
         return self._solves + self.env.solves
 
     def segment(self, number: int, tick: Tick) -> dict[str, float]:
@@ -113,14 +112,14 @@ class Sb3Trainer(Trainer):
         self.begin_segment(number)
         if self.model.ep_info_buffer is not None:
             self.model.ep_info_buffer.clear()
-        # A policy to start from would be lost to a value function that knows nothing yet.
+        # An untrained value function would ruin a policy to start from: it is fitted alone first.
         frozen = self._actor_parameters() if self._started and number == 0 else []
         for parameter in frozen:
             parameter.requires_grad_(False)
         self.model.set_env(self.env, force_reset=True)
         self.model.learn(
-            max(self.settings.of_segment(number) - self.steps, 1),
-            callback=_Watch(tick), reset_num_timesteps=False, log_interval=10,
+            max(self.settings.end_of(number) - self.steps, 1),
+            callback=_Progress(tick), reset_num_timesteps=False, log_interval=10,
         )  # fmt: skip
         for parameter in frozen:
             parameter.requires_grad_(True)
@@ -128,7 +127,7 @@ class Sb3Trainer(Trainer):
         return {"reward": float(np.mean([episode["r"] for episode in ended]))} if ended else {}
 
     def _actor_layers(self) -> list[torch.nn.Linear]:
-        """Layers from features to actions."""
+        """Return the layers from features to actions."""
         policy: Any = self.model.policy
         if isinstance(self.model, PPO):
             parts = [*policy.mlp_extractor.policy_net, policy.action_net]
@@ -145,12 +144,12 @@ class Sb3Trainer(Trainer):
         return [*own, self.model.policy.log_std]
 
     def state(self) -> dict[str, Any]:
-        """Networks, optimisers, counters, and of SAC and TD3 the replay buffer."""
+        """Return networks, optimisers, counters and, for SAC and TD3, the replay buffer."""
         model: Any = self.model
         state = {
             "parameters": model.get_parameters(),
             "steps": self.steps,
-            "updates": model._n_updates,  # noqa: SLF001  what TD3 delays by
+            "updates": model._n_updates,  # noqa: SLF001  counts the delays of TD3
             "solves": self.solves,
         }
         if getattr(model, "log_ent_coef", None) is not None:
@@ -166,7 +165,7 @@ class Sb3Trainer(Trainer):
         return state
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take a state back."""
+        """Return to a state."""
         model: Any = self.model
         model.set_parameters(state["parameters"], exact_match=True)
         model.num_timesteps, model._n_updates = state["steps"], state["updates"]  # noqa: SLF001
@@ -174,11 +173,11 @@ class Sb3Trainer(Trainer):
         if "entropy" in state:
             model.log_ent_coef.data.copy_(state["entropy"])
         if "buffer" in state:
-            buffer, kept = model.replay_buffer, state["buffer"]
+            buffer, stored = model.replay_buffer, state["buffer"]
             for name in KEPT:
-                getattr(buffer, name)[: len(kept[name])] = kept[name].numpy()
-            buffer.pos, buffer.full = kept["pos"], kept["full"]
+                getattr(buffer, name)[: len(stored[name])] = stored[name].numpy()
+            buffer.pos, buffer.full = stored["pos"], stored["full"]
 
     def policy(self, training: Mapping[str, Any]) -> Policy:
-        """The deterministic policy."""
+        """Return the deterministic policy."""
         return self.env.policy_of(self.model, self.settings.algorithm, training)

@@ -1,18 +1,50 @@
-"""Everything that determines a training, and the defaults of each algorithm."""
+"""Settings and hyperparameters of a training, with the defaults of each algorithm.
 
-import hashlib
-import json
+The hyperparameters are explained in `sb3_trainer` and `cloning`, which use them.
+"""
+
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from pathlib import Path
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from experiments.run.suites import HELD_OUT, SIX
-from experiments.training.hyperparameters import ALGORITHMS, complete
+from agents.learned.policy import ACTIVATIONS, ORIGINS
+from experiments.jobs.job import plain_values
+from experiments.jobs.paths import check_paths
+from experiments.training import ALGORITHMS
 from lpv_track_env import conditions, vehicle
 from lpv_track_env.reward import RewardWeights
 from trajectories.naming import choose
+
+PPO = {
+    "learning_rate": 1e-3, "last_learning_rate": 2e-5, "rollout": 32, "batch": 4096, "epochs": 4,
+    "discount": 0.97, "gae_lambda": 0.9, "clip_range": 0.2, "deviation": math.exp(-1.0),
+    "hidden": [64, 64], "activation": "tanh", "origin": "actuators",
+}  # fmt: skip
+OFF_POLICY = {
+    "learning_rate": 1e-3, "last_learning_rate": 2e-5, "buffer": 300_000, "batch": 256,
+    "gradient_steps": 16, "learning_starts": 10_000, "discount": 0.97, "target_rate": 0.01,
+    "hidden": [64, 64], "activation": "relu", "origin": "actuators",
+}  # fmt: skip
+HYPERPARAMETERS: dict[str, dict[str, Any]] = {
+    "ppo": PPO,
+    "residual": {**PPO, "deviation": math.exp(-2.0), "origin": "lpv-nmpc"},
+    "sac": OFF_POLICY,
+    "td3": {**OFF_POLICY, "noise": 0.2},
+    "bc": {
+        "learning_rate": 2e-3, "last_learning_rate": 1e-5, "round": 100, "batch": 4096,
+        "updates": 600, "expert_share": 0.25, "noise": 0.3,
+        "hidden": [64, 64], "activation": "tanh", "origin": "actuators",
+    },
+}  # fmt: skip
+"""Defaults of `--set` by algorithm."""
+BASE = "lpv-nmpc"
+"""Origin of a residual's actions."""
+NAMED = {"activation": ACTIVATIONS, "origin": ORIGINS}
+"""Values of the hyperparameters that are names."""
+# Ranges of the other hyperparameters: by default counts are at least 1, numbers at least 0.
+LEAST = {"batch": 2, "deviation": 1e-6, "clip_range": 1e-6, "target_rate": 1e-6}
+MOST = {"discount": 1.0, "gae_lambda": 1.0, "target_rate": 1.0, "expert_share": 1.0}
 
 ENVS = {"ppo": 512, "residual": 256, "sac": 64, "td3": 64, "bc": 256}
 STEPS = {
@@ -21,13 +53,12 @@ STEPS = {
 SEGMENTS = {
     "ppo": 1_000_000, "residual": 250_000, "sac": 100_000, "td3": 100_000, "bc": 100_000,
 }  # fmt: skip
-MOST_PATHS = 1000
-"""Random paths of one seed: the next seed's begin there."""
 
 REWARD = {
     "lateral_scale": 0.02, "heading": 0.1, "speed_scale": 0.5, "input_rate": 0.2,
 }  # fmt: skip
-"""Of `RewardWeights`, in training: centimetres count, which the environment's own 0.5 m hides.
+"""Weights of the training's reward, which the environment's own scale of 0.5 m would make blind to
+centimetres.
 
 With 0.05 m, PPO ends at twice the error in simulation; with 0.02 m it takes longer to stay on the
 road at first.
@@ -37,25 +68,26 @@ FAST: dict[str, Any] = {
     "conditions": ("simulation",), "steps": 5_000_000, "reward": {**REWARD, "lateral_scale": 0.05},
     "hyperparameters": {"batch": 2048, "epochs": 2},
 }  # fmt: skip
-"""`--fast` of PPO: perfect knowledge only, half as many updates, and a reward to begin with."""
+"""`--fast` of PPO: no disturbances, half as many updates, and a reward that is easier to begin
+with."""
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
     """A training: the same settings give the same weights, bit for bit, on the same machine.
 
-    `steps` are environment steps of all environments together; every `segment` of them a
-    checkpoint is written, seeds are set anew from (seed, segment) and all episodes begin anew, so
-    that a training that goes on from a checkpoint is the one that was not interrupted. `conditions`
-    share the environments evenly. `trajectories` are files or names; by default `paths` random
-    ones that only this seed trains on. `validation` paths are driven after every segment under
-    each kind of conditions. `start` is a policy file whose network is the first one.
+    `steps` are environment steps of all environments together. After every `segment` of them a
+    checkpoint is written, all seeds are drawn anew from (seed, segment) and all episodes restart,
+    so that a resumed training equals an uninterrupted one. `conditions` share the environments
+    evenly. `trajectories` are files or names; by default `paths` random ones that only this seed
+    trains on. `validation` paths are driven after every segment under each kind of conditions.
+    `start` is the file of a policy whose network the training starts from.
 
     Raises
     ------
     ValueError
-        For an unknown name, a number out of its range, segments in which nothing would be learned,
-        or a path that the benchmark drives.
+        For an unknown name, a number out of its range, segments too short to learn in, or a path
+        that the benchmark drives.
     """
 
     algorithm: str
@@ -84,25 +116,19 @@ class TrainingSettings:
         for name in ("steps", "envs", "segment", "paths", "validation"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if self.paths > MOST_PATHS:
-            raise ValueError(f"paths must be at most {MOST_PATHS}, not {self.paths}")
-        if not 0 <= self.seed < 1000:
-            raise ValueError(f"seed must be in [0, 999], not {self.seed}")
+        check_paths(self.trajectories, self.paths, self.seed, verb="train")
         if not self.conditions:
             raise ValueError("a training needs at least one kind of conditions")
         if self.envs < len(self.conditions):
             raise ValueError(f"{len(self.conditions)} conditions need as many environments")
         for given_conditions in self.conditions:
             conditions.load(given_conditions)
-        for name in self.trajectories:
-            if name.removesuffix("-raw") in (*SIX, *HELD_OUT):
-                raise ValueError(f"{name} is for evaluation: train on other paths")
         vehicle.load(self.vehicle)
         self.reward_weights()
         self._check_segments()
 
     def _check_segments(self) -> None:
-        """Refuse segments in which nothing is learned."""
+        """Refuse segments that end before the first update."""
         least = self.envs * self.hyperparameters.get(
             "rollout", self.hyperparameters.get("round", 1)
         )
@@ -118,7 +144,7 @@ class TrainingSettings:
             )
 
     def reward_weights(self) -> RewardWeights:
-        """Reward that the training maximises."""
+        """Return the weights of the reward that the training maximises."""
         for key, value in self.reward.items():
             choose("reward weight", key, tuple(item.name for item in fields(RewardWeights)))
             if isinstance(value, bool) or not isinstance(value, int | float):
@@ -130,24 +156,19 @@ class TrainingSettings:
         """Number of segments."""
         return math.ceil(self.steps / self.segment)
 
-    def of_segment(self, number: int) -> int:
-        """Steps that a segment is to end at."""
-        return min((number + 1) * self.segment, self.steps)
+    def end_of(self, segment: int) -> int:
+        """Return the number of steps at which a segment ends."""
+        return min((segment + 1) * self.segment, self.steps)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as JSON gives them back, and digests of the files that are named."""
-        named = [self.vehicle, *self.trajectories, *([self.start] if self.start else [])]
-        files = {
-            name: hashlib.sha256(Path(name).read_bytes()).hexdigest()
-            for name in named
-            if Path(name).is_file()
-        }
-        plain: dict[str, Any] = json.loads(json.dumps({**asdict(self), "files": files}))
-        return plain
+        """Return plain values, equal to what JSON gives back, with digests of the named files."""
+        return plain_values(
+            self, [self.vehicle, *self.trajectories, *([self.start] if self.start else [])]
+        )
 
 
 def usual(algorithm: str, **changes: Any) -> TrainingSettings:
-    """Settings of an algorithm with some changed; None changes nothing.
+    """Return the default settings of an algorithm with some changed; None changes nothing.
 
     Raises
     ------
@@ -164,13 +185,44 @@ def usual(algorithm: str, **changes: Any) -> TrainingSettings:
 
 
 def with_steps(settings: TrainingSettings, steps: int) -> TrainingSettings:
-    """Return the same training over so many steps."""
+    """Return the same training with another number of steps."""
     return replace(settings, steps=steps, segment=min(settings.segment, steps))
 
 
-def difference(settings: TrainingSettings, stored: Mapping[str, Any]) -> str | None:
-    """What differs between settings and stored ones, in words; None: nothing."""
-    for key, value in settings.as_dict().items():
-        if stored.get(key) != value:
-            return f"{key} is {value!r}, there {stored.get(key)!r}"
-    return None
+def complete(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Check hyperparameters and add the defaults of all others.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name, or a value that is of another kind than its default or out of range.
+    """
+    known = HYPERPARAMETERS[choose("algorithm", algorithm, ALGORITHMS)]
+    for key, value in given.items():
+        choose(f"hyperparameter of {algorithm}", key, tuple(known))
+        _check(key, value, known[key])
+    hyper = {**known, **given}
+    if hyper["origin"] == BASE != known["origin"]:
+        raise ValueError(f"only residual is trained on top of {BASE}, not {algorithm}")
+    return hyper
+
+
+def _check(key: str, value: Any, usual: Any) -> None:
+    """Refuse a hyperparameter of another kind than its default, or out of its range."""
+    if key in NAMED:
+        choose(key, value, NAMED[key])
+        return
+    if isinstance(usual, list):
+        good = (
+            isinstance(value, list)
+            and bool(value)
+            and all(type(width) is int and 0 < width <= 4096 for width in value)
+        )
+    else:
+        whole = isinstance(usual, int)
+        good = type(value) in ({int} if whole else {int, float}) and math.isfinite(value)
+        least, most = LEAST.get(key, int(whole)), MOST.get(key, math.inf)
+        if good and not least <= value <= most:
+            raise ValueError(f"hyperparameter {key} must be in [{least}, {most}], not {value}")
+    if not good:
+        raise ValueError(f"hyperparameter {key} must be like {usual!r}, not {value!r}")

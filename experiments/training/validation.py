@@ -1,4 +1,4 @@
-"""How good a policy is on paths that it does not train on, by the benchmark's own cases."""
+"""Validation of a policy on paths that it does not train on, as cases of the benchmark."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -6,13 +6,20 @@ from typing import Any
 
 import numpy as np
 
+from experiments.jobs.paths import VALIDATION_EPISODES, VALIDATION_PATHS, random_names
 from experiments.run.case import Case, run_case
-from experiments.training.seeds import VALIDATION_EPISODES, validation_names
 from experiments.training.settings import TrainingSettings
 
 
+def validation_names(settings: TrainingSettings) -> list[str]:
+    """Return the paths of the validation: the user's own, as in training, or else random ones."""
+    if settings.trajectories:
+        return list(settings.trajectories[: settings.validation])
+    return random_names(VALIDATION_PATHS, settings.validation)
+
+
 def cases(settings: TrainingSettings, policy: Path) -> list[dict[str, Any]]:
-    """Cases of a validation."""
+    """Return the cases of a validation."""
     return [
         Case(
             agent=str(policy),
@@ -33,10 +40,10 @@ def cases(settings: TrainingSettings, policy: Path) -> list[dict[str, Any]]:
 
 
 def validate(settings: TrainingSettings, policy: Path) -> dict[str, float]:
-    """Drive the validation cases: share that finished, ALE and MLE (m), steering.
+    """Drive the validation cases; return the share that finished, ALE and MLE (m), steering.
 
-    `loss`, by which the best policy is chosen, is what the drives fall short of the reward of
-    perfect tracking, 1 a second: the reward that the training maximises, mean over the drives.
+    `loss`, by which the best policy is chosen, is 1 minus the mean reward per second: perfect
+    tracking earns the training's reward at a rate of 1 a second.
 
     Raises
     ------

@@ -1,1 +1,4 @@
-"""Weights of the NMPC by tables, search, gradients and learning; their study; safe switching."""
+"""Tuning of the NMPC's weights by tables, search, gradients and learning: `lpv-track tune`."""
+
+METHODS = ("fixed", "paper", "search", "bands", "gradient", "catalogue", "rl", "paired")
+"""Names of the methods."""

@@ -1,10 +1,11 @@
 """A weight policy from drives in pairs: reinforcement learning without a critic.
 
-The two of a pair meet the same path, place, vehicle and disturbances; both follow the policy, each
-with an offset of its own on its actions, drawn anew every few windows. What their costs differ by
-is the offsets' doing: the noise that a critic would have to explain is the same in both (common
-random numbers; Ng and Jordan 2000). `PairedQuadratic` learns from all pairs so far how cost depends
-on actions and features; the policy, one linear layer, moves towards the best action of that.
+The two drives of a pair meet the same path, start, vehicle and disturbances. Both follow the
+policy, each with an offset of its own on its actions, drawn anew every few windows. The difference
+of their costs comes from the offsets alone: the noise that a critic would have to explain is the
+same in both (common random numbers; Ng and Jordan 2000). `PairedQuadratic` learns from all pairs so
+far how the cost depends on actions and features; the policy, one linear layer, moves towards the
+action that minimises it.
 """
 
 import io
@@ -22,25 +23,24 @@ from agents.weight_tuning.deciding import Decider
 from agents.weight_tuning.features import subset_mask
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import FAILED, SCALES, failed, rms_so_far, scores_of, squares_of
-from experiments.tuning.choices import choice_of
-from experiments.tuning.drives import Array, environments, first_seed, threads
+from experiments.jobs.paths import episode_seed
 from experiments.tuning.quadratic import PairedQuadratic, Prior
 from experiments.tuning.settings import TuningSettings
-from experiments.tuning.tuner import Tuner, unusable
+from experiments.tuning.tuner import Array, Tuner, choice_of, environments, threads, unusable
 from trajectories import ReferencePath
 from trajectories.fileio import write_atomically
 
 STATE = "paired.npz"
 LARGEST = 4.0
-"""Standard deviations of the noise that a difference counts as, at most: failures, breakdowns."""
+"""Limit of a difference of costs, in standard deviations of the noise: failed drives exceed it."""
 AVERAGED = 0.3
-"""Share of the budget, the last one, whose policies are averaged (Polyak and Juditsky 1992)."""
+"""Last share of the budget, whose policies are averaged (Polyak and Juditsky 1992)."""
 BIAS = 1.2
-"""Largest constant part of an action: the rest is for features to take back."""
+"""Largest constant part of an action; above 1, features can lower a clipped action."""
 
 
 class PairedLearning(Tuner):
-    """Rounds of `settings.drives` / 2 pairs, from the base weights on."""
+    """Rounds of `settings.drives` / 2 pairs, starting from the base weights."""
 
     def __init__(self, settings: TuningSettings, paths: list[ReferencePath]) -> None:
         super().__init__(settings)
@@ -53,7 +53,7 @@ class PairedLearning(Tuner):
         self._decider = Decider(self.choice, (), settings.control_period)
         self.loop = ClosedLoop(self.envs, agent, decider=self._decider, threads=threads())
         names = features.names(self.choice.bands.names)
-        # The weights in use are what was chosen: to be told them would be to be told u twice.
+        # The weights in use follow from the actions u: as features they would count u twice.
         own = np.array([not name.startswith("weight_") for name in names])
         self.seen: Array = subset_mask(settings.view, self.choice.bands.names) * own
         self.pairs = settings.drives // 2
@@ -74,15 +74,15 @@ class PairedLearning(Tuner):
 
     @property
     def cost(self) -> int:
-        """Solves of a round at most."""
+        """Largest number of solves of a round."""
         return self.settings.drives * self.stretches * self.hold * self._decider.window
 
     def step(self) -> dict[str, float]:
-        """One round: drives of all pairs, then a fit."""
+        """Run one round: drives of all pairs, then a fit."""
         hyper, before = self.settings.hyperparameters, self._solves
         random = np.random.default_rng((self.settings.seed, self._rounds))
         tally = self._drive_round(random)
-        # What counts half when the budget is spent once more `half_life`.
+        # A pair counts half after `half_life` budgets.
         spent = (self._solves - before) / (hyper["half_life"] * self.settings.solves)
         self.model.forget(0.5**spent)
         best = self.model.best(hyper["least_curvature"])
@@ -97,8 +97,8 @@ class PairedLearning(Tuner):
         return {"score": float(scores.mean()), "best": float(better.mean())}
 
     def _drive_round(self, random: np.random.Generator) -> Tally:
-        """Drive all pairs once and add what they tell; sums over the drives."""
-        first = first_seed(self.settings, self._rounds)
+        """Drive all pairs once and add them to the model; return the sums of the drives."""
+        first = episode_seed(self.settings.seed, self._rounds)
         self.loop.reset(seed=[first + k for k in range(self.pairs)] * 2)
         self.loop.attend(np.ones(self.settings.drives, dtype=np.bool_))
         sums = np.zeros((len(Tally._fields), self.settings.drives))
@@ -120,7 +120,7 @@ class PairedLearning(Tuner):
         return Tally(*sums)
 
     def _drive_stretch(self, offsets: Array) -> tuple[Array, Array, Array]:
-        """Drive `hold` windows: mean actions, mean features with a leading 1, and the tally."""
+        """Drive `hold` windows; return mean actions, mean features after a leading 1, the tally."""
         actions, seen = np.zeros_like(offsets), np.zeros((len(offsets), self.policy.shape[1]))
         driven = np.zeros((len(Tally._fields), len(offsets)))
         for _ in range(self.hold):
@@ -136,20 +136,21 @@ class PairedLearning(Tuner):
         return actions, seen, driven
 
     def _observe(self) -> Array:
-        """Features that are seen, a leading 1, (drives, 1 + features)."""
+        """Return a leading 1 and the features that the policy sees, (drives, 1 + features)."""
         x = self._decider.observe(self.envs.arrays.observations, self.loop.memory)
         return np.concatenate([np.ones((len(x), 1)), x * self.seen], axis=1)
 
     def _choose(self, actions: Array) -> None:
-        """Write what actions mean into the tables, for all bands: none ends a window here."""
+        """Write the weights of the actions into the tables of all bands, for the whole window."""
         for band in range(len(self.choice.bands)):
             bands = np.full(len(actions), band)
             self._decider.choose(actions, self.loop.running, bands, self.loop.memory)
 
     def _costs(self, stretch: Tally, drive: Tally, running: Array) -> Array:
-        """What a stretch adds to the score of its drive, to first order, (drives,).
+        """Return what a stretch adds to the score of its drive, to first order, (drives,).
 
-        The drive's root mean squares are those of both of a pair: a bad one is not forgiven.
+        The score's slope is at the root mean squares of both drives of a pair together, so that an
+        error costs the same in either.
         """
         squares = squares_of(drive)
         both = squares[: self.pairs] + squares[self.pairs :]
@@ -161,7 +162,7 @@ class PairedLearning(Tuner):
         return costs
 
     def result(self, provenance: Mapping[str, Any]) -> WeightPolicy:
-        """The mean of the last policies."""
+        """Return the mean of the last policies."""
         final = self._mean if self._averaged else self.policy
         layer = ((final[:, 1:] * self.seen).astype(np.float32), final[:, 0].astype(np.float32))
         return WeightPolicy(
@@ -171,7 +172,7 @@ class PairedLearning(Tuner):
         )  # fmt: skip
 
     def save(self, folder: Path) -> None:
-        """Write sums, policies and counters."""
+        """Write the model's sums, the policies and the counters."""
         buffer, model = io.BytesIO(), self.model
         np.savez(
             buffer, policy=self.policy, mean=self._mean, squares=model.squares,
@@ -181,8 +182,8 @@ class PairedLearning(Tuner):
         )  # fmt: skip
         write_atomically(folder / STATE, buffer.getvalue())
 
-    def restore(self, folder: Path) -> bool:
-        """Take up what `save` wrote; False where there is nothing of it."""
+    def read_state(self, folder: Path) -> bool:
+        """Read the state that `save` wrote; False if there is none."""
         file = folder / STATE
         if not file.exists():
             return False
@@ -200,9 +201,7 @@ class PairedLearning(Tuner):
                     raise ValueError(f"its {name} is {given.dtype} {given.shape}")
                 if not np.isfinite(given).all():
                     raise ValueError(f"its {name} is not finite")
-        except KeyError as error:
-            raise ValueError(unusable(file, str(error))) from None
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(unusable(file, str(error))) from None
         self.policy, self._mean = kept["policy"], kept["mean"]
         model.squares, model.products = kept["squares"], kept["products"]

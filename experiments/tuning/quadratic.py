@@ -1,17 +1,17 @@
-"""What pairs of drives tell of the weights' cost: a quadratic, its least point led by features.
+"""Quadratic model of the weights' cost, fitted to pairs of drives; its minimum is led by features.
 
-With u the action (entries,) and x the features, a leading 1 among them, of a stretch of driving::
+With u the action (entries,) and x the features of a stretch of driving, the first of them 1::
 
-    cost(u, x) = u' P u / 2 - u' M x + what u does not change
+    cost(u, x) = u' P u / 2 - u' M x + terms without u
 
-Of two drives alike but for u, what u does not change, disturbances above all, cancels; what the
-stretch before them left behind adds a term in the difference of its actions::
+In the difference of two drives that are alike but for u, the terms without u cancel, above all the
+disturbances. The stretch before adds a term in the difference of its actions::
 
     cost(u, x) - cost(v, x) = (u' P u - v' P v) / 2 - (u - v)' M x + c' (u - v of before) + noise
 
-That is linear in P, M and c: Bayesian linear regression (Bishop 2006, section 3.3) finds them, with
-normal priors around a bowl over the base weights. The best action is linear in the features: what
-an action costs in its own stretch and in the next one is least at P^-1 (M x - c).
+This is linear in P, M and c: Bayesian linear regression (Bishop 2006, section 3.3) finds them, with
+normal priors around a bowl over the base weights. The best action is linear in the features: the
+cost of an action in its own stretch and in the next one is least at P^-1 (M x - c).
 """
 
 import math
@@ -26,33 +26,33 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Prior:
-    """Normal priors, of cost a unit of action."""
+    """Normal priors of P, M and c, in cost per unit of action."""
 
     curvature: float
     """Mean of P's diagonal, and standard deviation of P's entries."""
     response: float
-    """Standard deviation of M's entries but for the constant feature's."""
+    """Standard deviation of M's entries, except those of the constant feature."""
     constant: float = 0.5
-    """Standard deviation of M's constant."""
+    """Standard deviation of M's entries of the constant feature."""
     carried: float = 0.1
     """Standard deviation of c."""
 
 
 NOISE = 0.2
-"""Standard deviation of the noise that a fit begins from."""
+"""Standard deviation of the noise before the first fit."""
 
 
 class PairedQuadratic:
-    """P, M and c, from pairs of stretches that are added.
+    """Regression of P, M and c on pairs of stretches.
 
     Parameters
     ----------
     entries
-        Of an action.
+        Number of entries of an action.
     features
-        Of a stretch, the leading 1 among them.
+        Number of features of a stretch, including the leading 1.
     prior
-        What is believed before.
+        Priors of P, M and c.
     """
 
     def __init__(self, entries: int, features: int, prior: Prior) -> None:
@@ -75,14 +75,18 @@ class PairedQuadratic:
         self.noise = NOISE
 
     def forget(self, share: float) -> None:
-        """Keep this share of what all pairs so far count."""
+        """Multiply the influence of all pairs so far by `share`."""
         self.squares *= share
         self.products *= share
         self.count *= share
         self.total *= share
 
     def add(self, plus: Array, minus: Array, x: Array, before: Array, difference: Array) -> None:
-        """Add n pairs: u, v (n, entries), features, u - v of before, differences (n,) of cost."""
+        """Add n pairs.
+
+        Actions u `plus` and v `minus`, and u - v of the stretch before, are (n, entries); features
+        `x` (n, features); the differences of cost (n,).
+        """
         apart = plus - minus
         rows = np.concatenate(
             [
@@ -98,11 +102,11 @@ class PairedQuadratic:
         self.count += len(difference)
 
     def _squares_of(self, u: Array) -> Array:
-        """Factors of P's upper entries in u' P u / 2."""
+        """Return the factors of P's upper entries in u' P u / 2."""
         return u[:, self._upper[0]] * u[:, self._upper[1]] * self._half
 
     def fit(self) -> tuple[Array, Array, Array]:
-        """P (entries, entries), M (entries, features), c (entries,); `noise` becomes the fit's."""
+        """Fit P (entries, entries), M (entries, features) and c (entries,), and update `noise`."""
         known = self.squares / self.noise**2 + np.diag(self._precision)
         found = np.linalg.solve(known, self.products / self.noise**2 + self._precision * self._mean)
         if self.count > 0.0:
@@ -116,7 +120,7 @@ class PairedQuadratic:
         return p, moved.reshape(self.entries, self.features), carried
 
     def best(self, least: float) -> Array:
-        """W (entries, features), W x the best action; eigenvalues of P are raised to `least`."""
+        """Return W (entries, features): W x is the best action, with P's eigenvalues >= `least`."""
         p, moved, carried = self.fit()
         moved = moved.copy()
         moved[:, 0] -= carried

@@ -1,34 +1,22 @@
-"""Everything that determines a tuning, and the defaults of each method."""
+"""Settings and hyperparameters of a tuning, with the defaults of each method."""
 
-import hashlib
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 from agents.weight_tuning.choice import DIRECTIONS
 from agents.weight_tuning.features import SUBSETS
-from experiments.run.suites import HELD_OUT, SIX
-from experiments.training.hyperparameters import LEAST, MOST
-from experiments.training.settings import MOST_PATHS
+from experiments.jobs.job import plain_values
+from experiments.jobs.paths import check_paths
+from experiments.training.settings import LEAST, MOST
+from experiments.tuning import METHODS
 from lpv_track_env import conditions, vehicle
 from trajectories.naming import choose
 
-METHODS: dict[str, str] = {
-    "fixed": "the default weights, nothing tuned",
-    "paper": "a set for each class of path, by its sharpest curvature; CMA-ES",
-    "search": "the best fixed set; CMA-ES",
-    "bands": "a set for each band of the preview's curvature; CMA-ES",
-    "gradient": "the same by gradients: differences of drives alike but for their weights",
-    "catalogue": "PPO chooses a set of a catalogue, every window",
-    "rl": "PPO multiplies the weights of the band at hand, every window",
-    "paired": "a linear policy does, learned from drives alike but for their weights",
-}
 PPO_METHODS = ("catalogue", "rl")
 LEARNED = (*PPO_METHODS, "paired")
-"""Methods whose result is a weight policy; that of the others is a schedule."""
+"""Methods that find a weight policy; the others find a schedule."""
 
 PPO: dict[str, Any] = {
     "learning_rate": 3e-3, "last_learning_rate": 3e-4, "rollout": 16, "batch": 256, "epochs": 10,
@@ -53,22 +41,26 @@ HYPERPARAMETERS: dict[str, dict[str, Any]] = {
         "step": 0.5,
     },
 }
-"""Defaults of `--set`. `sigma`: first standard deviation of candidates' log-multipliers; `pairs` of
-drives a step; `segment` solves between checkpoints.
+"""Defaults of `--set`.
+
+`sigma` is the first standard deviation of the candidates' log-multipliers; `pairs` the pairs of
+drives in a step; `segment` the solves between checkpoints.
+
 Of `paired`: `deviation` of an action's offsets, each held for `hold` windows; `curvature` and
-`response` of the prior, `least_curvature` of the cost (`quadratic`); `half_life` of a pair, in
-budgets; `step` towards the best policy of a fit."""
+`response` of the prior and `least_curvature` of the cost, see `quadratic`; `half_life` of a pair's
+influence, in budgets; `step`, the share of the way to the best policy of a fit.
+"""
 
 
 @dataclass(frozen=True)
 class TuningSettings:
     """A tuning: the same settings give the same weights, bit for bit, on the same machine.
 
-    The budget is in `solves` of the NMPC, never exceeded. Candidates are judged, and policies
-    learn, on `drives` side by side, each `time_limit` s of a random path of `paths` that only this
-    seed trains on, from a random place, under `conditions`; or of one's own `trajectories`.
-    `directions` and `span` bound what is chosen, around the default weights. `view` is what a
-    policy sees: "all", the "path" alone, or the "drive" alone.
+    The budget is in `solves` of the NMPC and is never exceeded. Candidates are scored, and policies
+    learn, on `drives` side by side. Each takes `time_limit` s from a random place of a path, under
+    `conditions`. The paths are the user's `trajectories`, or else `paths` random ones that only
+    this seed trains on. `directions` and `span` bound the weights around the default ones. `view`
+    is the part of the features that a policy sees: "all", the "path" alone, or the "drive" alone.
 
     Raises
     ------
@@ -95,7 +87,7 @@ class TuningSettings:
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        choose("method", self.method, tuple(METHODS))
+        choose("method", self.method, METHODS)
         choose("directions", self.directions, tuple(DIRECTIONS))
         choose("view", self.view, SUBSETS)
         known = HYPERPARAMETERS[self.method]
@@ -105,9 +97,6 @@ class TuningSettings:
         object.__setattr__(self, "hyperparameters", {**known, **self.hyperparameters})
         object.__setattr__(self, "trajectories", tuple(self.trajectories))
         self._check_numbers()
-        for name in self.trajectories:
-            if name.removesuffix("-raw") in (*SIX, *HELD_OUT):
-                raise ValueError(f"{name} is for evaluation: tune on other paths")
         conditions.load(self.conditions)
         vehicle.load(self.vehicle)
 
@@ -115,10 +104,7 @@ class TuningSettings:
         for name in ("solves", "paths", "drives"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if self.paths > MOST_PATHS:
-            raise ValueError(f"paths must be at most {MOST_PATHS}, not {self.paths}")
-        if not 0 <= self.seed < 1000:
-            raise ValueError(f"seed must be in [0, 999], not {self.seed}")
+        check_paths(self.trajectories, self.paths, self.seed, verb="tune")
         if not 1.0 < self.span <= 1e4:
             raise ValueError(f"span must be above 1 and at most 10000, not {self.span}")
         if not self.window > 0.0:
@@ -132,25 +118,19 @@ class TuningSettings:
         return max(math.ceil(self.time_limit / self.control_period - 1e-9), 1)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as JSON gives them back, and digests of the files that are named."""
-        files = {
-            name: hashlib.sha256(Path(name).read_bytes()).hexdigest()
-            for name in (self.vehicle, *self.trajectories)
-            if Path(name).is_file()
-        }
-        plain: dict[str, Any] = json.loads(json.dumps({**asdict(self), "files": files}))
-        return plain
+        """Return plain values, equal to what JSON gives back, with digests of the named files."""
+        return plain_values(self, [self.vehicle, *self.trajectories])
 
 
 def usual(method: str, **changes: Any) -> TuningSettings:
-    """Settings of a method with some changed; None changes nothing.
+    """Return the default settings of a method with some changed; None changes nothing.
 
     Raises
     ------
     ValueError
         As `TuningSettings`.
     """
-    choose("method", method, tuple(METHODS))
+    choose("method", method, METHODS)
     given = {key: value for key, value in changes.items() if value is not None}
     if method in PPO_METHODS:
         given = {"drives": 64, "time_limit": 20.0, **given}

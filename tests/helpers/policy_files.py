@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from agents.learned import policy as driving
-from agents.learned.files import Kind, layer_tensors
+from agents.learned.policy import Kind, layer_tensors
 from agents.weight_tuning import policy as weights
 from tests.helpers import learned_policies, weight_policies
 

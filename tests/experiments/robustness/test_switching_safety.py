@@ -15,9 +15,8 @@ from agents.weight_tuning.choice import SLEW
 from agents.weight_tuning.closed_loop import ClosedLoop
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
 from experiments import cli
-from experiments.robustness import command as switching_command
+from experiments.commands.switching import base_of, widest_kept
 from experiments.robustness import switching
-from experiments.robustness.summary import summary, weights_before_loss, widest_kept
 from experiments.robustness.switching import (
     ADVERSARY,
     CONTROL,
@@ -30,6 +29,8 @@ from experiments.robustness.switching import (
     Setup,
     arms_of,
     drive_arm,
+    summary,
+    weights_before_loss,
 )
 from experiments.run.statistics import rate_bound
 from lpv_track_env import kernels as k
@@ -242,7 +243,7 @@ def test_switching(
         small = Setup(**{**vars(setup), "paths": 2, "time_limit": 1.0})
         return drive_arm(small, arm, tick)
 
-    monkeypatch.setattr(switching_command, "drive_arm", counted)
+    monkeypatch.setattr(switching, "drive_arm", counted)
     all_driven: list[str] = []
     for code in (cli.EXIT_INTERRUPTED, cli.EXIT_INTERRUPTED, 0, 0):
         driven.clear()
@@ -311,8 +312,8 @@ def test_a_file_of_the_base_weights(tmp_path: Path) -> None:
     base = TrackingWeights(Q=(0.5, 1.0, 2.0, 2.0))
     bands = CurvatureBands()
     WeightSchedule(bands, (base,) * 4).write(tmp_path / "one.json")
-    assert switching_command.base_of(tmp_path / "one.json") == base
-    assert switching_command.base_of(None) == TrackingWeights()
+    assert base_of(tmp_path / "one.json") == base
+    assert base_of(None) == TrackingWeights()
     WeightSchedule(bands, (base, base, base, TrackingWeights())).write(tmp_path / "four.json")
     with pytest.raises(ValueError, match=r"four\.json holds no single set"):
-        switching_command.base_of(tmp_path / "four.json")
+        base_of(tmp_path / "four.json")

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import agents
+from experiments.jobs.paths import TRAINING_PATHS, VALIDATION_PATHS
 from experiments.run.case import Case
 from experiments.run.suites import (
     BESIDE,
@@ -17,7 +18,6 @@ from experiments.run.suites import (
     SUITES,
     default_agents,
 )
-from experiments.training.seeds import TRAINING_PATHS, VALIDATION_PATHS
 from lpv_track_env.observation import ObservationLayout
 from tests.helpers.learned_policies import random_policy
 from tests.helpers.policy_files import DRIVING

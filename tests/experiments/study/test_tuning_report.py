@@ -1,4 +1,4 @@
-"""The tuning study's page: what its tables say is what was judged; a folder is one study's."""
+"""The tuning study's page: what its tables say is what was measured; a folder is one study's."""
 
 import json
 import math
@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from agents.weights import TrackingWeights, WeightSchedule
+from experiments.jobs.job import PROGRESS
 from experiments.study.evaluation import FIGURES, IN_BANDS, EvaluationSet
-from experiments.study.ladder import BASELINE
 from experiments.study.oracle import Headroom
 from experiments.study.report import write_report
-from experiments.study.study import Study, write_figures
-from experiments.study.tables import judged
-from experiments.tuning.loop import PROGRESS, WEIGHTS
+from experiments.study.study import BASELINE, Study, write_figures
+from experiments.study.tables import rung_result
+from experiments.tuning.loop import WEIGHTS
 from trajectories import CurvatureBands
 
 SETS = (
@@ -46,18 +46,18 @@ def fixture_made(tmp_path: Path) -> Study:
                 **dict.fromkeys(FIGURES, zero), **dict.fromkeys(IN_BANDS, np.nan * zero),
                 "score": score, "lateral": score, "in_straight": score,
             }  # fmt: skip
-            write_figures(made.judged(given.name, one.label, seed), figures)
+            write_figures(made.evaluation(given.name, one.label, seed), figures)
     return made
 
 
-def test_a_judged_rung_is_its_figures(made: Study) -> None:
-    bands = judged(made, "held-out", "bands")
+def test_results_of_a_rung_are_its_figures(made: Study) -> None:
+    bands = rung_result(made, "held-out", "bands")
     assert (bands.score.value, bands.score.low, bands.score.high) == (1.5, 1.5, 1.5)
     assert (bands.tracking, bands.comfort, bands.solves, bands.seconds) == (1.5, 0.0, 900, 2.0)
     assert bands.gain is not None
     assert bands.gain.value == pytest.approx(0.25)
     assert (bands.failures, bands.drives) == (0, 8)
-    default, baseline = (judged(made, "held-out", label) for label in ("default", BASELINE))
+    default, baseline = (rung_result(made, "held-out", label) for label in ("default", BASELINE))
     assert default.gain is not None
     assert default.gain.value == pytest.approx(-1.0)
     assert default.solves == 0.0
@@ -84,7 +84,7 @@ class Balance(HTMLParser):
         self.text += data
 
 
-def test_the_page_says_what_was_judged(made: Study, tmp_path: Path) -> None:
+def test_the_page_says_what_was_measured(made: Study, tmp_path: Path) -> None:
     headroom = [Headroom("nothing", 2.0, 2.0), Headroom("the path", 1.0, 1.5)]
     summary = write_report(made, headroom, 1.0, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()

@@ -1,4 +1,4 @@
-"""Judging of weights against single cases of the benchmark, and a study that goes on."""
+"""Evaluation of weights against single cases of the benchmark, and a study that goes on."""
 
 import math
 from pathlib import Path
@@ -18,28 +18,32 @@ from agents.weight_tuning.policy import WeightPolicy, load
 from agents.weight_tuning.score import FAILED, PARTS
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments.cli import parser
+from experiments.commands.tune import settings_of
 from experiments.run.case import Case, run_case
 from experiments.run.metrics import evaluate
 from experiments.run.rollout import rollout
-from experiments.study import ladder, study
+from experiments.study import study
 from experiments.study.evaluation import (
     FIGURES,
     IN_BANDS,
     EvaluationSet,
-    Judge,
+    Evaluator,
     band_scores,
     usual_sets,
 )
-from experiments.study.ladder import BASELINE, CURVATURE, EVERY, LADDER, OURS, Rung, baseline_of
 from experiments.study.study import (
+    BASELINE,
+    OURS,
+    RUNGS,
+    Rung,
     Study,
     checked_labels,
     read_figures,
-    run_judging,
+    run_evaluations,
     run_trainings,
+    rung_of,
     write_figures,
 )
-from experiments.tuning.command import settings_of
 from experiments.tuning.settings import LEARNED, usual
 from lpv_track_env import kernels
 from lpv_track_env.env import PathTrackingEnv
@@ -60,9 +64,9 @@ SCHEDULE = WeightSchedule(
 SETTINGS: dict[str, Any] = {"time_limit": 4.0}
 
 
-def judged(result: Any, conditions: str, **more: Any) -> dict[str, Array]:
+def evaluated(result: Any, conditions: str, **more: Any) -> dict[str, Array]:
     given = EvaluationSet("few", ("figure-eight",), conditions, 2, env_settings=SETTINGS)
-    figures = Judge(given).judge(result, **more)
+    figures = Evaluator(given).evaluate(result, **more)
     assert set(figures) == set(FIGURES)
     assert all(values.shape == (1, 2) for values in figures.values())
     return {name: values[0] for name, values in figures.items()}
@@ -71,7 +75,7 @@ def judged(result: Any, conditions: str, **more: Any) -> dict[str, Array]:
 def test_scores_in_bands_are_those_of_their_periods() -> None:
     """On a circle all periods are of one band; on a figure of eight squares add up over bands."""
     given = EvaluationSet("few", ("circle", "figure-eight"), "realtime", 2, env_settings=SETTINGS)
-    figures = Judge(given).judge(SCHEDULE)
+    figures = Evaluator(given).evaluate(SCHEDULE)
     assert not figures["failed"].any()
     np.testing.assert_allclose(figures["in_moderate"][0], figures["score"][0], rtol=1e-9)
     for band in ("straight", "gentle", "sharp"):
@@ -130,8 +134,10 @@ def check_against_case(figures: dict[str, Array], seed: int, case: dict[str, Any
 
 
 @pytest.mark.parametrize("conditions", ["simulation", "realtime", "randomised"])
-def test_a_judged_schedule_drives_as_the_benchmarks_agent(conditions: str, tmp_path: Path) -> None:
-    figures = judged(SCHEDULE, conditions)
+def test_an_evaluated_schedule_drives_as_the_benchmarks_agent(
+    conditions: str, tmp_path: Path
+) -> None:
+    figures = evaluated(SCHEDULE, conditions)
     SCHEDULE.write(tmp_path / "weights.json")
     settings = {"weights": str(tmp_path / "weights.json")}
     for seed in (0, 1):
@@ -153,21 +159,21 @@ def driven(agent: str, seed: int, conditions: str, **settings: Any) -> dict[str,
     return {"metrics": metrics, "trace": found.trace.as_dict(), "end": found.end}
 
 
-def test_judged_by_path_it_drives_with_the_path_s_set() -> None:
-    figures = judged(SCHEDULE, "realtime", by_path=True)
+def test_evaluated_by_path_it_drives_with_the_path_s_set() -> None:
+    figures = evaluated(SCHEDULE, "realtime", by_path=True)
     check_against_case(
         figures, 0, driven("lpv-nmpc", 0, "realtime", weights=SCHEDULE, selection="path")
     )
     sharpest = WeightSchedule(SCHEDULE.bands, (SCHEDULE.weights[-1],) * 4)
-    for name, values in judged(sharpest, "realtime").items():
+    for name, values in evaluated(sharpest, "realtime").items():
         np.testing.assert_array_equal(figures[name], values, err_msg=name)
-    assert (figures["score"] != judged(SCHEDULE, "realtime")["score"]).all()
+    assert (figures["score"] != evaluated(SCHEDULE, "realtime")["score"]).all()
 
 
-def test_a_judged_policy_drives_as_the_benchmarks_agent() -> None:
+def test_an_evaluated_policy_drives_as_the_benchmarks_agent() -> None:
     choice = WeightChoice(SCHEDULE, span=3.0)
     policy: WeightPolicy = random_weight_policy(1, choice=choice, layout=ObservationLayout())
-    figures = judged(policy, "realtime")
+    figures = evaluated(policy, "realtime")
     for seed in (0, 1):
         check_against_case(
             figures, seed, driven("lpv-nmpc-tuned", seed, "realtime", weights=policy)
@@ -177,7 +183,7 @@ def test_a_judged_policy_drives_as_the_benchmarks_agent() -> None:
 def test_a_drive_that_fails_scores_as_one() -> None:
     narrow = {"time_limit": 4.0, "max_lateral_error": 0.01}
     given = EvaluationSet("narrow", ("circle", "figure-eight"), seeds=2, env_settings=narrow)
-    figures = Judge(given).judge(SCHEDULE)
+    figures = Evaluator(given).evaluate(SCHEDULE)
     np.testing.assert_array_equal(figures["failed"], 1.0)
     np.testing.assert_array_equal(figures["score"], FAILED)
     assert (figures["max_cte"] > 0.01).all()
@@ -192,21 +198,20 @@ def test_evaluation_sets_are_of_paths_that_tuning_refuses() -> None:
                 usual("search", trajectories=(name,))
 
 
-# The ladder and the study ------------------------------------------------------------------------
+# Rungs and the study ----------------------------------------------------------------------------
 
 
 def test_rungs_differ_in_what_they_say() -> None:
-    assert len({one.label for one in EVERY}) == len(EVERY)
-    for one in EVERY:
+    assert len({one.label for one in RUNGS}) == len(RUNGS)
+    for one in RUNGS:
         settings = one.settings(3, 1000)
         assert (settings.method, settings.seed) == (one.method, 3)
         assert (settings.view, settings.conditions) == (one.view, one.conditions)
         assert settings.solves == 1000 * one.factor
-        assert ladder.rung(baseline_of(one)).conditions == one.conditions
-        assert ladder.rung(one.label) is one
-    assert {one.factor for one in EVERY if BASELINE in one.label} == {10}
-    assert ladder.rung(OURS).method in LEARNED
-    assert not set(LADDER) & set(CURVATURE)
+        assert rung_of(one.baseline).conditions == one.conditions
+        assert rung_of(one.label) is one
+    assert {one.factor for one in RUNGS if BASELINE in one.label} == {10}
+    assert rung_of(OURS).method in LEARNED
     assert checked_labels(["rl", "default"]) == ("rl", "default")
     with pytest.raises(ValueError, match="gradient"):
         checked_labels(["gradent"])
@@ -231,10 +236,10 @@ LABELS = ("default", "search", "rl")
 def fixture_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Study:
     """A study of three rungs and two seeds, in this process."""
     short = {
-        label: ShortRung(label, ladder.rung(label).method, "short", 1 + (label == "rl"))
+        label: ShortRung(label, rung_of(label).method, "short", 1 + (label == "rl"))
         for label in LABELS
     }
-    monkeypatch.setattr(study, "rung", short.__getitem__)
+    monkeypatch.setattr(study, "rung_of", short.__getitem__)
     monkeypatch.setattr(study, "local_pool", lambda specs, _, run, **__: map(run, specs))
     few = EvaluationSet(
         "few, short", ("circle", "sine"), "simulation", 2, env_settings={"time_limit": 1.0}
@@ -252,11 +257,11 @@ def test_a_study_is_made_read_and_not_made_again(short: Study) -> None:
         ("rl", 0), ("rl", 1), ("default", 0), ("search", 0), ("search", 1),
     ]  # fmt: skip
     assert list(run_trainings(short, 1)) == [(k, 5) for k in range(6)]
-    assert list(run_judging(short, 1)) == [(0, 1), (1, 1)]
+    assert list(run_evaluations(short, 1)) == [(0, 1), (1, 1)]
     made = times(short.folder)
     assert len(made) == 10
     assert list(run_trainings(short, 1)) == [(0, 0)]
-    assert list(run_judging(short, 1)) == [(0, 0)]
+    assert list(run_evaluations(short, 1)) == [(0, 0)]
     assert times(short.folder) == made
 
     for label in LABELS:
@@ -271,7 +276,7 @@ def test_a_study_is_made_read_and_not_made_again(short: Study) -> None:
             assert bool(lines) == (label != "default")
             assert all(line["solves"] <= 100 * (1 + (label == "rl")) for line in lines)
     weights = load(short.training("search", 1) / "weights.json")
-    again = Judge(short.sets[0]).judge(weights)
+    again = Evaluator(short.sets[0]).evaluate(weights)
     for name, values in short.read("few, short", "search").items():
         np.testing.assert_array_equal(values[1], again[name])
 
@@ -279,9 +284,9 @@ def test_a_study_is_made_read_and_not_made_again(short: Study) -> None:
     lost = short.training("search", 0) / "weights.json"
     score = short.read("few, short", "search")["score"]
     lost.unlink()
-    short.judged("few, short", "search", 0).unlink()
+    short.evaluation("few, short", "search", 0).unlink()
     assert list(run_trainings(short, 1)) == [(0, 1), (1, 1)]
-    assert list(run_judging(short, 1)) == [(0, 1), (1, 1)]
+    assert list(run_evaluations(short, 1)) == [(0, 1), (1, 1)]
     now = times(short.folder)
     assert {name for name in made if now[name] != made[name]} == {
         "trainings/search-0/weights.json", "judged/few-short/search-0.npz",
@@ -289,7 +294,7 @@ def test_a_study_is_made_read_and_not_made_again(short: Study) -> None:
     np.testing.assert_array_equal(short.read("few, short", "search")["score"], score)
 
 
-@pytest.mark.parametrize("one", EVERY, ids=lambda one: one.label)
+@pytest.mark.parametrize("one", RUNGS, ids=lambda one: one.label)
 def test_the_command_of_a_rung_asks_for_its_settings(one: Rung) -> None:
     options = parser().parse_args(one.command(3, 5000).split()[1:])
     assert settings_of(options) == one.settings(3, 5000)

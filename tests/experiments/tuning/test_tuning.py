@@ -27,10 +27,12 @@ from agents.weight_tuning.choice import SLEW
 from agents.weight_tuning.policy import WeightPolicy, load
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments import cli
+from experiments.jobs.paths import load_paths
 from experiments.run.provenance import revision, versions
-from experiments.tuning import options
-from experiments.tuning.drives import TuningDrives, load_paths, path_names, weights_at
-from experiments.tuning.settings import HYPERPARAMETERS, LEARNED, METHODS, TuningSettings, usual
+from experiments.tuning import METHODS
+from experiments.tuning.loop import path_names
+from experiments.tuning.settings import HYPERPARAMETERS, LEARNED, TuningSettings, usual
+from experiments.tuning.tuner import TuningDrives, weights_at
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -142,7 +144,7 @@ def test_no_two_seeds_tune_on_the_same_paths() -> None:
 
 def test_candidates_of_a_round_meet_the_same_drives_and_another_round_others() -> None:
     settings = usual("search", trajectories=("sine",), drives=3, time_limit=1.0, window=0.4)
-    drives = TuningDrives(settings, load_paths(settings))
+    drives = TuningDrives(settings, load_paths(path_names(settings)))
     default = TrackingWeights().as_array()
     first = drives.scores(default, 0)
     softer = drives.scores(np.concatenate([0.1 * default[:8], default[8:]]), 0)
@@ -168,7 +170,7 @@ def test_the_help_names_what_there_is(capsys: pytest.CaptureFixture[str]) -> Non
     with pytest.raises(SystemExit):
         cli.main(["tune", "--help"])
     said = " ".join(capsys.readouterr().out.split())
-    assert options.METHODS == tuple(METHODS) == tuple(HYPERPARAMETERS)
+    assert tuple(HYPERPARAMETERS) == METHODS
     for method, defaults in HYPERPARAMETERS.items():
         for name in (method, *defaults):
             assert name in said
@@ -186,7 +188,8 @@ def test_without_the_extra_it_says_what_to_install(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     found = importlib.util.find_spec
-    missing = "experiments.tuning.command.find_spec"
-    monkeypatch.setattr(missing, lambda name: None if name == lacking else found(name))
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == lacking else found(name)
+    )
     error = refusal(capsys, *words(method, "--out", str(tmp_path)))
     assert f"needs {lacking}: pip install 'lpv-track-env[{extra}]'" in error

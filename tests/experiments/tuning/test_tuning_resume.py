@@ -19,8 +19,8 @@ pytest.importorskip("cma")
 import torch
 
 from experiments import cli
-from experiments.training import checkpoint
-from experiments.training.lock import alone_in
+from experiments.jobs import checkpoint
+from experiments.jobs.job import locked
 from experiments.tuning import loop
 from experiments.tuning.paired import STATE as PAIRED
 from experiments.tuning.search import STATE
@@ -249,7 +249,7 @@ def test_a_tuning_at_its_end_stays_as_it_is(tmp_path: Path) -> None:
 
 
 def test_one_process_tunes_in_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with alone_in(tmp_path):
+    with locked(tmp_path):
         error = refusal(capsys, *words("search"), "--out", str(tmp_path))
     assert "another process" in error
     assert not (tmp_path / "settings.json").exists()

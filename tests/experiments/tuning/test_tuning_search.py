@@ -12,10 +12,9 @@ pytest.importorskip("cma")
 
 import trajectories
 from agents.weights import TrackingWeights
-from experiments.tuning.by_path import PathClassSearch
-from experiments.tuning.drives import load_paths
-from experiments.tuning.gradient import GradientSearch
-from experiments.tuning.search import CmaSearch, Search
+from experiments.jobs.paths import load_paths
+from experiments.tuning.loop import path_names
+from experiments.tuning.search import CmaSearch, GradientSearch, PathClassSearch, Search
 from experiments.tuning.settings import HYPERPARAMETERS, usual
 
 Array = NDArray[Any]
@@ -24,10 +23,10 @@ CIRCLE: dict[str, Any] = {
 }  # fmt: skip
 
 
-def judged_by(
+def scored_by(
     monkeypatch: pytest.MonkeyPatch, kind: type[Search], score: Callable[[Array], float]
 ) -> None:
-    monkeypatch.setattr(kind, "judge", lambda _, points, __: [score(point) for point in points])
+    monkeypatch.setattr(kind, "evaluate", lambda _, points, __: [score(point) for point in points])
 
 
 def searching(method: str, rows: int, **changes: Any) -> Search:
@@ -42,7 +41,7 @@ def test_cma_es_finds_the_optimum_of_a_quadratic(
 ) -> None:
     best = np.random.default_rng(0).uniform(-2.0, 2.0, rows * 6)
     steepness = 10.0 ** np.linspace(0.0, 1.0, best.size)
-    judged_by(monkeypatch, CmaSearch, lambda x: float(steepness @ (x - best) ** 2))
+    scored_by(monkeypatch, CmaSearch, lambda x: float(steepness @ (x - best) ** 2))
     search = searching("search", rows)
     np.testing.assert_array_equal(search.point, np.zeros((rows, 6)))
     for _ in range(120 if rows == 1 else 500):
@@ -55,7 +54,7 @@ def test_cma_es_finds_the_optimum_of_a_quadratic(
 
 
 def test_cma_es_stays_within_the_span(monkeypatch: pytest.MonkeyPatch) -> None:
-    judged_by(monkeypatch, CmaSearch, lambda x: float(np.sum((x - 9.0) ** 2)))
+    scored_by(monkeypatch, CmaSearch, lambda x: float(np.sum((x - 9.0) ** 2)))
     search = searching("search", 1, span=10.0)
     for _ in range(60):
         search.step()
@@ -83,7 +82,7 @@ def test_gradients_are_those_of_the_smoothed_score() -> None:
 def test_a_pair_differs_in_its_weights_only() -> None:
     settings = usual("gradient", trajectories=("sine",), time_limit=1.0,
                      hyperparameters={"pairs": 3})  # fmt: skip
-    search = GradientSearch(settings, load_paths(settings), 1)
+    search = GradientSearch(settings, load_paths(path_names(settings)), 1)
     scores = np.array(search.judge([np.zeros(6)] * 6, 0)).reshape(3, 2)
     np.testing.assert_array_equal(scores[:, 0], scores[:, 1])
     assert len(set(scores[:, 0])) == 3
@@ -93,7 +92,7 @@ def test_a_pair_differs_in_its_weights_only() -> None:
 
 def test_gradients_descend(monkeypatch: pytest.MonkeyPatch) -> None:
     best = np.random.default_rng(0).uniform(-2.0, 2.0, 24)
-    judged_by(monkeypatch, GradientSearch, lambda x: float(0.5 * np.sum((x - best) ** 2)))
+    scored_by(monkeypatch, GradientSearch, lambda x: float(0.5 * np.sum((x - best) ** 2)))
     search = searching("gradient", 4, hyperparameters={"learning_rate": 0.1})
     for _ in range(300):
         search.step()
@@ -107,7 +106,7 @@ def test_gradients_descend(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def by_class(solves: int, *names: str) -> PathClassSearch:
     settings = usual("paper", **{**CIRCLE, "trajectories": names, "solves": solves})
-    return PathClassSearch(settings, load_paths(settings))
+    return PathClassSearch(settings, load_paths(path_names(settings)))
 
 
 def test_each_class_of_path_has_its_share_of_the_budget() -> None:

@@ -16,14 +16,14 @@ NAME = "checkpoint.pt"
 
 
 def write(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write a folder's checkpoint, in place of the last one."""
+    """Write the checkpoint of a folder, in place of the last one."""
     buffer = io.BytesIO()
     torch.save({"format": FORMAT, **content}, buffer)
     write_atomically(folder / NAME, buffer.getvalue())
 
 
 def read(folder: Path) -> dict[str, Any] | None:
-    """Read a folder's checkpoint; None where there is none.
+    """Read the checkpoint of a folder; None if there is none.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def read(folder: Path) -> dict[str, Any] | None:
         pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError, OSError,
         zipfile.BadZipFile,
     ) as error:  # fmt: skip
-        # torch's own text is many lines long and advises to load it unsafely.
+        # PyTorch's own message is many lines long and advises loading the file unsafely.
         reason = error if isinstance(error, ValueError) else type(error).__name__
         raise ValueError(
             f"{file} cannot be read ({reason}): remove it, and the training begins anew"

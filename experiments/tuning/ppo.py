@@ -1,8 +1,8 @@
 """Weight policies by PPO (Schulman et al. 2017; Stable-Baselines3), in segments that can resume.
 
-A segment is a function of networks, optimiser and counters, and of (seed, segment): everything that
-is random is seeded anew, all episodes begin anew. So a tuning that goes on from a checkpoint is the
-one that was not interrupted.
+A segment depends only on networks, optimiser and counters, and on (seed, segment): at its beginning
+all random generators are seeded anew and all episodes restart. A resumed tuning therefore equals an
+uninterrupted one.
 """
 
 import random
@@ -18,17 +18,16 @@ from agents.weight_tuning.features import subset_mask
 from agents.weight_tuning.learner import WeightLearnerVecEnv
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.vector_env import WeightTuningVectorEnv
-from experiments.training import checkpoint
-from experiments.tuning.choices import choice_of
-from experiments.tuning.drives import first_seed, threads
+from experiments.jobs import checkpoint
+from experiments.jobs.paths import episode_seed
 from experiments.tuning.settings import TuningSettings
-from experiments.tuning.tuner import Tuner
+from experiments.tuning.tuner import Tuner, choice_of, threads
 from lpv_track_env import vehicle
 from trajectories import ReferencePath
 
 
 class PolicyLearning(Tuner):
-    """PPO on `WeightTuning-v0`, from the default weights on."""
+    """PPO on `WeightTuning-v0`, starting from the default weights."""
 
     def __init__(self, settings: TuningSettings, paths: list[ReferencePath]) -> None:
         super().__init__(settings)
@@ -52,7 +51,7 @@ class PolicyLearning(Tuner):
             device="cpu", policy_kwargs=self._network(),
         )  # fmt: skip
         if self.choice.catalogue:
-            # The default set, the first one, to begin with.
+            # Begin with the default set, which is the first of the catalogue.
             with torch.no_grad():
                 self.model.policy.action_net.bias[0] = 2.0  # type: ignore[operator]
 
@@ -65,14 +64,14 @@ class PolicyLearning(Tuner):
         return network
 
     def _rate(self, _: float) -> float:
-        """Learning rate, linear in the solves."""
+        """Return the present learning rate, linear in the solves."""
         first, last = self.hyper["learning_rate"], self.hyper["last_learning_rate"]
         share = min(self.solves / self.settings.solves, 1.0) if hasattr(self, "model") else 0.0
         return float(first + share * (last - first))
 
     @property
     def rollout(self) -> int:
-        """Solves of a rollout at most."""
+        """Largest number of solves of a rollout."""
         steps = round(self.settings.window / self.settings.control_period)
         return int(self.settings.drives * self.hyper["rollout"] * max(steps, 1))
 
@@ -83,21 +82,21 @@ class PolicyLearning(Tuner):
 
     @property
     def cost(self) -> int:
-        """Solves of a rollout at most."""
+        """Largest number of solves of a rollout."""
         return self.rollout
 
     def step(self) -> dict[str, float]:
-        """One segment: rollouts and updates until the next would exceed its solves."""
+        """Run one segment: rollouts and updates until the next would exceed its solves."""
         settings, number = self.settings, self._segment
         seed = int(np.random.SeedSequence((settings.seed, number)).generate_state(1)[0])
         random.seed(seed)
         np.random.seed(seed)  # noqa: NPY002  where SB3 draws from
         torch.manual_seed(seed)
-        self.env.seed(first_seed(settings, number))
+        self.env.seed(episode_seed(settings.seed, number))
         self.model.set_env(self.env, force_reset=True)
         end = min((number + 1) * self.hyper["segment"], settings.solves)
         rewards: list[float] = []
-        # At least once, or a segment shorter than a rollout would learn nothing for ever.
+        # At least one rollout: a segment shorter than one would never end.
         while not rewards or self.solves + self.rollout <= end:
             steps = settings.drives * self.hyper["rollout"]
             self.model.learn(steps, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]
@@ -106,7 +105,7 @@ class PolicyLearning(Tuner):
         return {"score": -float(np.mean(rewards)), "best": -float(np.max(rewards))}
 
     def layers(self) -> list[tuple[Any, Any]]:
-        """Layers from features to outputs, (W, b)."""
+        """Return the layers (W, b) from features to outputs."""
         policy: Any = self.model.policy
         parts = [*policy.mlp_extractor.policy_net, policy.action_net]
         return [
@@ -116,11 +115,11 @@ class PolicyLearning(Tuner):
         ]
 
     def result(self, provenance: Mapping[str, Any]) -> WeightPolicy:
-        """The policy of the mean action, or of the likeliest set."""
+        """Return the policy that takes the mean action, or the likeliest set."""
         return self.env.policy_of(self.layers(), self.settings.method, provenance)
 
     def save(self, folder: Path) -> None:
-        """Write networks, optimiser, counters."""
+        """Write networks, optimiser and counters."""
         checkpoint.write(
             folder,
             {
@@ -130,8 +129,8 @@ class PolicyLearning(Tuner):
             },
         )  # fmt: skip
 
-    def restore(self, folder: Path) -> bool:
-        """Take up what `save` wrote; False where there is nothing of it."""
+    def read_state(self, folder: Path) -> bool:
+        """Read the state that `save` wrote; False if there is none."""
         kept = checkpoint.read(folder)
         if kept is None:
             return False
@@ -142,7 +141,7 @@ class PolicyLearning(Tuner):
             self.model.num_timesteps = int(kept["steps"])
             self.model._n_updates = int(kept["updates"])  # noqa: SLF001
         except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-            # PyTorch tells of every layer that does not fit, a line each.
+            # PyTorch writes a line for every layer that does not fit.
             reason = str(error).split("\n", 1)[0]
             raise ValueError(
                 f"{folder / checkpoint.NAME} is of another training ({reason}): remove it, and the "

@@ -1,0 +1,1 @@
+"""What trainings and tunings share: resumable jobs, checkpoints, paths and seeds."""

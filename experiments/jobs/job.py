@@ -1,0 +1,207 @@
+"""Jobs that run in steps, can be interrupted anywhere, and resume with the same bits.
+
+A job has a folder to itself. The folder holds `settings.json`, `progress.jsonl` with a line for
+every step, the state that the job resumes from, and its result. Each step depends only on the
+settings and on the state before it: a resumed job ends with the same bits as an uninterrupted one.
+"""
+
+import contextlib
+import json
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Protocol
+
+from experiments.run.process import Interrupts
+from experiments.run.provenance import file_digest
+from trajectories.fileio import write_atomically
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks: two jobs in one folder are not refused there
+    fcntl = None  # type: ignore[assignment]
+
+SETTINGS, PROGRESS = "settings.json", "progress.jsonl"
+
+Line = dict[str, Any]
+
+
+class Settings(Protocol):
+    """Settings that determine the result of a job."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, equal to what JSON gives back."""
+
+
+class Listener:
+    """Receives the progress of a job; this one ignores it."""
+
+    def loading(self, done: int, count: int) -> None:
+        """Receive how many of all paths are loaded."""
+
+    def tick(self, done: int, words: str) -> None:
+        """Receive the progress within a step, and a few words on it."""
+
+    def line(self, line: Line) -> None:
+        """Receive the line of a step, once its state is saved."""
+
+
+class Job(ABC):
+    """A computation in steps; `lines` are those of the steps done so far."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.lines: list[Line] = []
+
+    @property
+    @abstractmethod
+    def done(self) -> bool:
+        """True when no step is left."""
+
+    @abstractmethod
+    def step(self) -> Line:
+        """Run one step; return what its line tells, but for `seconds`."""
+
+    def conclude(self, line: Line) -> Line:
+        """Evaluate what a step came to, outside the time in its line; return the whole line."""
+        return line
+
+    @abstractmethod
+    def save(self, folder: Path) -> None:
+        """Write the state that `restore` reads, atomically."""
+
+    @abstractmethod
+    def restore(self, folder: Path) -> bool:
+        """Read the state that `save` wrote, with its lines; False if there is none.
+
+        Raises
+        ------
+        ValueError
+            In one line, if a file cannot be used.
+        """
+
+
+def run_job(
+    job: Job, folder: Path, listener: Listener, *, seconds_at_most: float = math.inf
+) -> list[Line]:
+    """Run the steps that are left, or as many as the time allows; return all lines.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        On Ctrl-C; the folder keeps every step but the interrupted one.
+    """
+    write_settings(folder, job.settings)
+    if job.lines:
+        _write_lines(folder, job.lines)
+    before = job.lines[-1]["seconds"] if job.lines else 0.0
+    began = time.perf_counter()
+    with Interrupts() as interrupts:
+        while not job.done:
+            told = job.step()
+            interrupts.check()
+            line = job.conclude({**told, "seconds": before + time.perf_counter() - began})
+            interrupts.check()
+            job.lines.append(line)
+            # A job that is killed between these two resumes from the state before the line.
+            _write_lines(folder, job.lines)
+            job.save(folder)
+            listener.line(line)
+            if line["seconds"] > seconds_at_most:
+                break
+    return job.lines
+
+
+@contextlib.contextmanager
+def claimed(folder: Path, settings: Settings, kind: str) -> Iterator[bool]:
+    """Make a folder a job's own; the value is True if it holds the same job already.
+
+    Parameters
+    ----------
+    kind
+        "training" or "tuning", for the messages.
+
+    Raises
+    ------
+    ValueError
+        If another process uses the folder, or it holds a job with other settings.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        stored = stored_settings(folder, kind)
+        if stored is not None and (differs := difference(settings, stored)):
+            raise ValueError(f"{folder} holds a {kind} with other settings: {differs}")
+        yield stored is not None
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Lock a folder for as long as this process lives, however it ends.
+
+    Raises
+    ------
+    ValueError
+        If another process holds the lock.
+    """
+    with (folder / ".lock").open("w") as handle:
+        if fcntl is not None:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ValueError(
+                    f"another process trains in {folder}: wait for it, or give another --out"
+                ) from None
+        yield
+
+
+def stored_settings(folder: Path, kind: str) -> Mapping[str, Any] | None:
+    """Read the settings of the job in a folder; None if there is none.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read.
+    """
+    file = folder / SETTINGS
+    if not file.exists():
+        return None
+    try:
+        content: dict[str, Any] = json.loads(file.read_text())
+        if not isinstance(content, dict):
+            raise TypeError(f"{SETTINGS} holds no settings")
+    except (OSError, TypeError, ValueError) as error:
+        raise ValueError(f"{folder} holds no {kind} to go on with: {error}") from None
+    return content
+
+
+def write_settings(folder: Path, settings: Settings) -> None:
+    """Write the settings of a job."""
+    write_atomically(folder / SETTINGS, json.dumps(settings.as_dict(), indent=2).encode())
+
+
+def difference(settings: Settings, stored: Mapping[str, Any]) -> str | None:
+    """Describe the first difference between settings and stored ones; None if they are equal."""
+    for key, value in settings.as_dict().items():
+        if stored.get(key) != value:
+            return f"{key} is {value!r}, there {stored.get(key)!r}"
+    return None
+
+
+def plain_values(settings: Any, named: Iterable[str]) -> dict[str, Any]:
+    """Convert a dataclass to what JSON gives back, with the digests of the named files."""
+    files = {name: file_digest(Path(name)) for name in named if Path(name).is_file()}
+    plain: dict[str, Any] = json.loads(json.dumps({**asdict(settings), "files": files}))
+    return plain
+
+
+def read_lines(folder: Path) -> list[Line]:
+    """Read the lines of a folder's `progress.jsonl`."""
+    return [json.loads(line) for line in (folder / PROGRESS).read_text().splitlines()]
+
+
+def _write_lines(folder: Path, lines: Sequence[Line]) -> None:
+    text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
+    write_atomically(folder / PROGRESS, text.encode())
