@@ -165,13 +165,13 @@ class CmaSearch(Search):
     def ask(self) -> list[Array]:
         """Draw candidates."""
         with self._own_random():
-            self._asked = self._es.ask()
-        return [np.asarray(point) for point in self._asked]
+            self._candidates = self._es.ask()
+        return [np.asarray(point) for point in self._candidates]
 
     def tell(self, scores: Sequence[float]) -> None:
         """Update the distribution."""
         with self._own_random():
-            self._es.tell(self._asked, list(scores))
+            self._es.tell(self._candidates, list(scores))
 
     def evaluate(self, points: list[Array], number: int) -> list[float]:
         """Return mean scores, all on the same drives."""

@@ -83,7 +83,7 @@ def test_a_pair_differs_in_its_weights_only() -> None:
     settings = usual("gradient", trajectories=("sine",), time_limit=1.0,
                      hyperparameters={"pairs": 3})  # fmt: skip
     search = GradientSearch(settings, load_paths(path_names(settings)), 1)
-    scores = np.array(search.judge([np.zeros(6)] * 6, 0)).reshape(3, 2)
+    scores = np.array(search.evaluate([np.zeros(6)] * 6, 0)).reshape(3, 2)
     np.testing.assert_array_equal(scores[:, 0], scores[:, 1])
     assert len(set(scores[:, 0])) == 3
     points = search.ask()
