@@ -39,8 +39,9 @@ def comparison_section(document: Document, cases: Sequence[Result], rows: Sequen
     """Return errors by agent as figures of the first family, then the tables of every setting."""
     parts = [
         paragraph(
-            f"{tables.PUBLISHED_NOTE} Max CTE and MLE, by formula the same, use the foot point on "
-            "the path. Several seeds (×n): mean ± 95 % interval by the t-distribution."
+            f"{tables.PUBLISHED_NOTE} Max CTE and MLE, equal by formula, refer to the foot point "
+            "on the path. Rows of several seeds (×n) show the mean ± the 95 % interval by the "
+            "t-distribution."
         )
     ]
     if any(case.get("training") for case in cases):
@@ -245,9 +246,8 @@ def by_band(lines: Mapping[str, Sequence[Line]], styles: Styles) -> list[Panel]:
 
 
 def _band_table(lines: Iterable[Line]) -> str:
-    headings = [
-        (name, f"{words} 1/m") for name, words in zip(BANDS.names, band_ranges(), strict=True)
-    ]
+    ranges = [f"{words} 1/m" for words in band_ranges()]
+    headings: list[Cell] = ["agent", *zip(BANDS.names, ranges, strict=True)]
     cells = [
         [label, *((cell.error, cell.basis) if cell else "–" for cell in found)]
         for label, found in lines

@@ -20,10 +20,10 @@ from experiments.run.statistics import rate_interval
 from experiments.run.tables import Result
 
 KEY_NOTE = (
-    "ALE, AOE: root mean square lateral and heading error, MLE: largest lateral error; over all "
+    "ALE, AOE: root mean square lateral and heading error; MLE: largest lateral error; over all "
     "runs that did not fail, with the 95 % interval over seeds where there are several. An episode "
-    "that ended early counts for the part it drove. “Against published”: mean over T1 to T6 of "
-    "ours divided by the published value of the same kind."
+    "that ended early counts for the part it drove. “Against published”: our ALE divided by the "
+    "published one for the same kind of conditions, mean over T1 to T6."
 )
 END_HEADINGS = (
     "agent", "drives", "whole path", "left the corridor", "other ends", "failed cases",

@@ -46,8 +46,9 @@ SYMBOLS = {
 PUBLISHED_LABEL = "published"
 PUBLISHED_DECIMALS = 2
 PUBLISHED_NOTE = (
-    "Published rows: kumar2025lpv; simulation, and beside other conditions its runs with the "
-    "vehicle. Its vehicle, weights and paths are not public: they stand there for orientation."
+    "Published rows are from kumar2025lpv: its simulations, and beside other conditions its runs "
+    "with the vehicle. They are for orientation only, since its vehicle, weights and paths are not "
+    "public."
 )
 
 

@@ -200,6 +200,17 @@ def test_the_report_is_one_sound_file_that_fetches_nothing(tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
+def test_every_line_of_a_table_has_a_cell_for_each_heading(tmp_path):
+    banded = {"ale_sharp": 0.1, "share_sharp": 1.0}
+    failed = case(3, "pid", status="failed", end=None, error="no")
+    folder_of(tmp_path, [case(1, metrics=banded), case(2, "lqr"), failed])
+    tables = re.findall(r"<table.*?</table>", page(tmp_path), re.DOTALL)
+    assert len(tables) >= 8
+    for table in tables:
+        head, *lines = re.findall(r"<tr.*?</tr>", table, re.DOTALL)
+        assert {len(re.findall(r"<t[dh]", line)) for line in lines} == {head.count("<th")}
+
+
 def test_every_foreign_word_is_escaped(tmp_path):
     results = [
         case(1, agent=HOSTILE, warnings=[HOSTILE]),
