@@ -8,7 +8,6 @@ drive: in SB3's `evaluate_policy`, in this project's rollouts and in its reports
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
@@ -103,59 +102,46 @@ class DrivingTask:
             ) from None
 
 
-class TaskSpecific(Protocol):
-    """A policy, learned or searched for, that fits one observation layout and control period."""
-
-    @property
-    def layout(self) -> ObservationLayout:
-        """Layout of its observations."""
-        ...
-
-    @property
-    def control_period(self) -> float:
-        """Time between its actions, s."""
-        ...
-
-    @property
-    def training(self) -> Mapping[str, Any]:
-        """Origin of the policy; "vehicle" is the name of the vehicle that it was trained on."""
-        ...
-
-
 def check_compatible(
-    name: str, policy: TaskSpecific, task: DrivingTask, *, stacklevel: int = 3
+    name: str,
+    task: DrivingTask,
+    *,
+    layout: ObservationLayout,
+    control_period: float,
+    vehicle: object = None,
+    stacklevel: int = 3,
 ) -> None:
-    """Check that a policy fits the observations and the control period of a task.
+    """Check that a policy made for a layout and a control period (s) fits a task.
 
-    It warns if the policy was trained on another vehicle, `stacklevel` as in `warnings.warn`.
+    It warns if the policy was trained on another vehicle, given by name; `stacklevel` as in
+    `warnings.warn`.
 
     Raises
     ------
     ValueError
         Naming the policy and the difference.
     """
-    seen, here = policy.layout, task.layout
-    same_layout = seen.preview_steps == here.preview_steps and math.isclose(
-        seen.preview_period, here.preview_period, rel_tol=1e-9
+    here = task.layout
+    same_layout = layout.preview_steps == here.preview_steps and math.isclose(
+        layout.preview_period, here.preview_period, rel_tol=1e-9
     )
-    same_period = math.isclose(policy.control_period, task.control_period, rel_tol=1e-9)
-    layout = f"preview_steps={seen.preview_steps}, preview_period={seen.preview_period:g}"
-    period = f"control_period={policy.control_period:g}"
+    same_period = math.isclose(control_period, task.control_period, rel_tol=1e-9)
+    preview = f"preview_steps={layout.preview_steps}, preview_period={layout.preview_period:g}"
+    period = f"control_period={control_period:g}"
     if not same_layout:
-        wanted = layout if same_period else f"{layout}, {period}"
+        wanted = preview if same_period else f"{preview}, {period}"
         raise ValueError(
-            f"{name} sees {layout} s; this environment has {here.preview_steps} and "
+            f"{name} sees {preview} s; this environment has {here.preview_steps} and "
             f"{here.preview_period:g}: make the environment with {wanted}, or train one for it"
         )
     if not same_period:
         raise ValueError(
-            f"{name} acts every {policy.control_period:g} s, this environment every "
+            f"{name} acts every {control_period:g} s, this environment every "
             f"{task.control_period:g}: make the environment with {period}, or train one for it"
         )
-    trained = policy.training.get("vehicle")
-    if isinstance(trained, str) and trained != task.vehicle.name:
+    if isinstance(vehicle, str) and vehicle != task.vehicle.name:
         warnings.warn(
-            f"{name} was trained for vehicle {trained!r}, not for {task.vehicle.name!r}",
+            f"{name} was trained for vehicle {vehicle!r}, not for {task.vehicle.name!r}",
             UserWarning,
             stacklevel=stacklevel,
         )

@@ -112,7 +112,7 @@ def source_file(name: str) -> Path | None:
 
 
 def parameters_of(name: str) -> dict[str, inspect.Parameter] | None:
-    """Return an agent's settings by name, or None where its class takes any or does not tell.
+    """Return the parameters of an agent's class by name; None if they are not declared.
 
     Raises
     ------

@@ -46,7 +46,10 @@ class LearnedPolicy:
         self.task = task
         name = f"policy {policy.algorithm!r}" if isinstance(policy, Policy) else f"policy {policy}"
         self.policy = policy if isinstance(policy, Policy) else read(policy)
-        check_compatible(name, self.policy, task, stacklevel=4)
+        check_compatible(
+            name, task, layout=self.policy.layout, control_period=self.policy.control_period,
+            vehicle=self.policy.training.get("vehicle"), stacklevel=4,
+        )  # fmt: skip
         self._size = task.layout.size
         self._network = Network.of(self.policy, *task.action_bounds)
         self._base = RtiNmpc(task) if self.policy.origin == "lpv-nmpc" else None

@@ -4,12 +4,14 @@ Every row is evaluated alone and in the same order, so its action does not depen
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.learned.files import Layer
 from agents.learned.policy import ORIGINS, Policy
 from lpv_track_env.observation import ACCELERATION, STEERING_ANGLE
 from trajectories.compilation import compiled, compiled_inline
@@ -137,6 +139,18 @@ def act(
     return lost
 
 
+def pack_layers(
+    layers: Sequence[Layer], activations: Sequence[str]
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Pack layers and their activations into `weights` and `table` (layers, 4) for `act`."""
+    table, packed, start = [], [np.zeros(0, dtype=np.float32)], 0
+    for (weight, bias), kind in zip(layers, activations, strict=True):
+        table.append([start, weight.shape[1], weight.shape[0], ACTIVATIONS.index(kind)])
+        packed += [weight.T.ravel(), bias]
+        start += weight.size + bias.size
+    return np.concatenate(packed), np.array(table, dtype=np.int64).reshape(-1, 4)
+
+
 @dataclass(eq=False)
 class Network:
     """A policy in the arrays that `act` takes."""
@@ -153,15 +167,11 @@ class Network:
         """Pack a policy and the bounds (2,) of its actions, in SI units."""
         stages = [(policy.feature_weight, policy.feature_bias), *policy.layers]
         activations = ["clip", *[policy.activation] * (len(policy.layers) - 1), policy.squash]
-        table, packed, start = [], [], 0
-        for (weight, bias), kind in zip(stages, activations, strict=True):
-            table.append([start, weight.shape[1], weight.shape[0], ACTIVATIONS.index(kind)])
-            packed += [weight.T.ravel(), bias]
-            start += weight.size + bias.size
+        weights, table = pack_layers(stages, activations)
         numbers = np.concatenate([[policy.feature_limit], policy.centre, policy.half, low, high])
         return cls(
-            np.concatenate(packed),
-            np.array(table, dtype=np.int64),
+            weights,
+            table,
             numbers,
             np.stack([np.ones_like(policy.mirror), policy.mirror][: 1 + policy.symmetric]),
             ORIGINS.index(policy.origin),

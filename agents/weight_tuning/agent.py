@@ -83,7 +83,11 @@ class TunedNmpc:
         policy = self.weights if isinstance(self.weights, WeightPolicy) else None
         if policy is not None:
             named = weights if isinstance(weights, str | Path) else repr(policy.algorithm)
-            check_compatible(f"policy of weights {named}", policy, task, stacklevel=4)
+            check_compatible(
+                f"policy of weights {named}", task, layout=policy.layout,
+                control_period=policy.control_period, vehicle=policy.training.get("vehicle"),
+                stacklevel=4,
+            )  # fmt: skip
         self.nmpc = RtiNmpc(
             task,
             horizon=horizon,
