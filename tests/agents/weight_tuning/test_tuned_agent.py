@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import agents
 from agents.delay import DelayCompensated
-from agents.weight_tuning import files
+from agents.weight_tuning import policy as policies
 from agents.weight_tuning.agent import SHIPPED, TunedNmpc
 from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.closed_loop import ClosedLoop
@@ -342,7 +342,7 @@ def test_files_of_weights(tmp_path: Path) -> None:
     )
     observation = env.arrays.observations.copy()
     np.testing.assert_array_equal(given.predict(observation)[0], read.predict(observation)[0])
-    files.write(POLICIES["joint"], tmp_path / "policy.json")
+    policies.write(POLICIES["joint"], tmp_path / "policy.json")
     given, read = (
         agents.make(NAME, env.single, weights=weights)
         for weights in (POLICIES["joint"], tmp_path / "policy.json")
@@ -373,7 +373,7 @@ def test_make_wraps_nothing_around_it() -> None:
 def test_shipped_weights_are_what_their_commands_say() -> None:
     methods = {}
     for name, file in SHIPPED.items():
-        result = files.load(file)
+        result = policies.load(file)
         given = result.training if isinstance(result, WeightPolicy) else result.provenance
         assert given["settings"]["method"] == name
         assert f"--method {name}" in given["command"]
@@ -384,7 +384,7 @@ def test_shipped_weights_are_what_their_commands_say() -> None:
 
 @pytest.mark.parametrize("conditions", ["simulation", "realtime", "randomised"])
 def test_the_shipped_policy_adapts_and_drives(conditions: str) -> None:
-    policy = files.load(SHIPPED["paired"])
+    policy = policies.load(SHIPPED["paired"])
     assert isinstance(policy, WeightPolicy)
     loop = loop_of(4, {"trajectory": "T2", "conditions": conditions}, policy)
     loop.reset(seed=3)
