@@ -1,8 +1,8 @@
 """The dynamic bicycle: the project's only copy of the vehicle's physics.
 
-`field` is plain arithmetic (+ - *) on its arguments: sines, cosines and the inverse speed come in
-from outside. So the same function runs on floats inside numba, on NumPy arrays, on CasADi symbols
-and on torch tensors; only the few lines that prepare its arguments differ from backend to backend.
+`field` is plain arithmetic on its arguments, which include sines, cosines and the inverse speed. So
+the same function runs on floats inside numba, on NumPy arrays, on CasADi symbols and on torch
+tensors; only the few lines that prepare its arguments differ between backends.
 
 Model (kumar2025lpv, section II; state x = [vx, vy, psi, r, X, Y], input u = [a, delta])::
 
@@ -15,11 +15,11 @@ Model (kumar2025lpv, section II; state x = [vx, vy, psi, r, X, Y], input u = [a,
     Fyf  = Caf (delta - (vy + lf r)/vx)
     Fyr  = Car (-(vy - lr r)/vx)
 
-From 1 m/s upwards (the paper's domain) the field is exactly this. Below, 1/vx is continued by a
-polynomial that keeps the field twice continuously differentiable, finite at standstill and sound
-in reverse, where tyres damp lateral motion as they do forwards: with q(vx) = `inverse_speed` and
-the signed direction s = vx q (exactly 1 from 1 m/s upwards), slip angles are
-delta s - (vy + lf r) q and -(vy - lr r) q, and rolling resistance is mu g s.
+From 1 m/s upwards (the paper's domain) the field is exactly this. Below 1 m/s a polynomial replaces
+1/vx, which keeps the field twice continuously differentiable, finite at standstill, and correct in
+reverse, where tyres damp lateral motion as they do forwards. With q(vx) = `inverse_speed` and the
+signed direction s = vx q (exactly 1 from 1 m/s upwards), the slip angles are
+delta s - (vy + lf r) q and -(vy - lr r) q, and rolling resistance decelerates by mu g s.
 """
 
 from typing import Any
@@ -30,25 +30,24 @@ from numpy.typing import NDArray
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.compilation import compiled, compiled_internal
 
+# Entries of the state: m/s, m/s, rad, rad/s, m, m.
 VX, VY, PSI, YAW_RATE, X, Y = range(6)
-STATE_NAMES = ("vx", "vy", "psi", "r", "X", "Y")
 STATE_SIZE = 6
 ACTION_SIZE = 2
 LOW_SPEED = 1.0
-"""m/s below which 1/|vx| is replaced by a polynomial: the lower end of the paper's speed range."""
-
-
+"""m/s below which a polynomial replaces 1/|vx|: the lower end of the paper's speed range."""
 LONGEST_SUBSTEP = 0.005
-"""s; shortened where the vehicle's fastest pole at standstill asks for it."""
+"""s; a vehicle's fastest pole at standstill can require a shorter substep."""
 POLE_STEP = 1.5
-"""Largest product of substep and pole; Runge-Kutta's stability ends at 2.78."""
+"""Largest product of substep and fastest pole; the Runge-Kutta method is stable up to 2.78."""
 
 
 def inverse_speed_polynomial(ratio: Any, bounded_speed: Any) -> Any:
-    """Continuation q of 1/|vx|, for any backend; equals 1/|vx| exactly where |vx| >= LOW_SPEED.
+    """Compute q, which continues 1/|vx| to standstill, for any backend.
 
-    `ratio` is min(|vx| / LOW_SPEED, 1) and `bounded_speed` is max(|vx|, LOW_SPEED). Below
-    LOW_SPEED, q = (15 - 10 w^2 + 3 w^4) / (8 LOW_SPEED) meets 1/|vx| with two derivatives.
+    `ratio` is w = min(|vx| / LOW_SPEED, 1) and `bounded_speed` is max(|vx|, LOW_SPEED). From
+    LOW_SPEED upwards q is exactly 1/|vx|. Below, q = (15 - 10 w^2 + 3 w^4) / (8 LOW_SPEED), which
+    agrees with 1/|vx| and its first two derivatives at LOW_SPEED.
     """
     squared = ratio * ratio
     return (15.0 - 10.0 * squared + 3.0 * squared * squared) / (8.0 * bounded_speed)
@@ -73,11 +72,11 @@ def field(
     car: Any,
     rolling_deceleration: Any,
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """Time derivative of [vx, vy, psi, r, X, Y]; `q` is the inverse speed, see the module."""
-    # Slips are axle velocities, slip angle times |vx|; q makes them angles at the very end, and
-    # forces are written out as linear forms of vx, vy, r. So a stage of an integrator waits for
-    # one division and few operations beside it, and what stays within a control period (stiffnesses
-    # with mass, inertia and steering angle) stands in front of vx, vy and r.
+    """Compute the time derivative of [vx, vy, psi, r, X, Y]; `q` is the inverse speed."""
+    # Slips are axle velocities, slip angle times |vx|, which q turns into angles at the very end;
+    # forces are linear forms of vx, vy, r. So each stage of an integrator waits for one division
+    # and few other operations, and the factors that are constant within a control period
+    # (stiffnesses with mass, inertia and steering angle) stand in front of vx, vy and r.
     inverse_mass, inverse_inertia = 1.0 / mass, 1.0 / yaw_inertia
     front, rear = caf * cos_delta, car
     drag = caf * sin_delta * inverse_mass
@@ -101,7 +100,7 @@ def field(
 
 
 def inverse_speed_slope_polynomial(ratio: Any, bounded_speed: Any, vx: Any) -> Any:
-    """Derivative dq/dvx of `inverse_speed_polynomial`, with the same arguments, for any backend."""
+    """Compute dq/dvx of `inverse_speed_polynomial`, with its arguments and vx, for any backend."""
     return (
         vx * (12.0 * ratio * ratio - 20.0) / (8.0 * bounded_speed * bounded_speed * bounded_speed)
     )
@@ -126,8 +125,8 @@ def jacobian(
 ) -> tuple[Any, Any, Any, Any, Any, Any, Any, Any, Any, Any, Any, Any]:
     """Partial derivatives of `field`'s (vx', vy', r') with respect to (vx, vy, r, delta).
 
-    Row by row: the four of vx', of vy', of r'. `slope` is dq/dvx. The other derivatives are plain:
-    dvx'/da = 1, and (X', Y') turn with psi.
+    The 12 values come row by row: those of vx', of vy', of r'. `slope` is dq/dvx. The remaining
+    derivatives need no function: dvx'/da = 1, and those of (X', Y') rotate with psi.
     """
     direction, direction_slope = vx * q, q + vx * slope
     front = caf * (delta * direction - (vy + lf * r) * q)
@@ -154,7 +153,7 @@ def jacobian(
 
 
 def inverse_speed(vx: Any) -> Any:
-    """q(vx) on floats or NumPy arrays, 1/(m/s): 1/|vx| from LOW_SPEED on, finite below."""
+    """Compute q(vx), s/m, on floats or NumPy arrays: 1/|vx| from LOW_SPEED upwards, finite below."""
     speed = np.abs(vx)
     return inverse_speed_polynomial(
         np.minimum(speed / LOW_SPEED, 1.0), np.maximum(speed, LOW_SPEED)
@@ -166,7 +165,7 @@ def derivative(
     action: NDArray[np.float64] | Any,
     parameters: VehicleParameters,
 ) -> NDArray[np.float64]:
-    """Vector field x' = f(x, u) on NumPy arrays.
+    """Compute the vector field x' = f(x, u) on NumPy arrays.
 
     Parameters
     ----------
@@ -175,7 +174,7 @@ def derivative(
     action
         [a, delta], shape (2,) or (2, n); m/s^2, rad (counter-clockwise positive).
     parameters
-        The vehicle.
+        Parameters of the vehicle.
 
     Returns
     -------
@@ -195,50 +194,28 @@ def derivative(
         )
     vx, vy, psi, r, _, _ = x
     a, delta = u
-    return np.array(
-        np.broadcast_arrays(
-            *field(
-                vx,
-                vy,
-                r,
-                np.cos(psi),
-                np.sin(psi),
-                a,
-                delta,
-                np.cos(delta),
-                np.sin(delta),
-                inverse_speed(vx),
-                *parameters.as_array(),
-            )
-        )
-    )
+    rates = field(
+        vx, vy, r, np.cos(psi), np.sin(psi), a, delta, np.cos(delta), np.sin(delta),
+        inverse_speed(vx), *parameters.as_array(),
+    )  # fmt: skip
+    return np.array(np.broadcast_arrays(*rates))
 
 
 def casadi_derivative(state: Any, action: Any, parameters: VehicleParameters) -> Any:
-    """Vector field on CasADi symbols: state (6, 1), action (2, 1), result (6, 1)."""
+    """Compute the vector field (6, 1) on CasADi symbols: state (6, 1), action (2, 1)."""
     import casadi as ca
 
     vx, vy, psi, r, _, _ = ca.vertsplit(state)
     a, delta = ca.vertsplit(action)
-    return ca.vertcat(
-        *field(
-            vx,
-            vy,
-            r,
-            ca.cos(psi),
-            ca.sin(psi),
-            a,
-            delta,
-            ca.cos(delta),
-            ca.sin(delta),
-            casadi_inverse_speed(vx),
-            *parameters.as_array(),
-        )
-    )
+    rates = field(
+        vx, vy, r, ca.cos(psi), ca.sin(psi), a, delta, ca.cos(delta), ca.sin(delta),
+        casadi_inverse_speed(vx), *parameters.as_array(),
+    )  # fmt: skip
+    return ca.vertcat(*rates)
 
 
 def casadi_inverse_speed(vx: Any) -> Any:
-    """q(vx) on CasADi symbols."""
+    """Compute q(vx) on CasADi symbols."""
     import casadi as ca
 
     speed = ca.fabs(vx)
@@ -246,10 +223,10 @@ def casadi_inverse_speed(vx: Any) -> Any:
 
 
 def fastest_pole(vx: float, parameters: VehicleParameters) -> float:
-    """Largest magnitude of the lateral dynamics' poles at speed vx and delta = 0, 1/s.
+    """Largest magnitude of the lateral dynamics' poles at speed vx (m/s) and delta = 0, 1/s.
 
-    The poles of the (vy, r) block of A; an explicit integrator's step must resolve it (RK4 is
-    stable up to 2.78 / pole for real poles).
+    These are the poles of the (vy, r) block of A. An explicit integrator's step must resolve them:
+    for real poles, RK4 is stable up to a step of 2.78 / pole.
     """
     p = parameters
     q = float(inverse_speed(vx))
@@ -266,7 +243,7 @@ def fastest_pole(vx: float, parameters: VehicleParameters) -> float:
 
 
 def longest_substep(parameters: VehicleParameters) -> float:
-    """Longest step of the integration that resolves a vehicle's dynamics at any speed, s."""
+    """Longest integration step that resolves a vehicle's dynamics at any speed, s."""
     return min(LONGEST_SUBSTEP, POLE_STEP / fastest_pole(0.0, parameters))
 
 
@@ -278,7 +255,7 @@ compiled_inverse_speed_slope_polynomial = compiled(inverse_speed_slope_polynomia
 
 @compiled_internal
 def compiled_inverse_speed(vx: float) -> float:
-    """q(vx) inside compiled kernels, for a single vehicle: no polynomial where it is 1/|vx|."""
+    """Compute q(vx) in compiled code for a single vehicle, branching where it is 1/|vx|."""
     speed = abs(vx)
     if speed >= LOW_SPEED:
         return 1.0 / speed
@@ -288,9 +265,9 @@ def compiled_inverse_speed(vx: float) -> float:
 
 @compiled_internal
 def compiled_inverse_speed_of_lanes(vx: float) -> float:
-    """The same number, bit for bit, without a branch: for loops over vehicles side by side.
+    """Compute the same q(vx), bit for bit, without a branch, for vectorised loops over vehicles.
 
-    From LOW_SPEED on the polynomial is 8 / (8 |vx|), and a power of two does not round.
+    From LOW_SPEED upwards the polynomial is 8 / (8 |vx|), and powers of two do not round.
     """
     speed = abs(vx)
     value: float = compiled_inverse_speed_polynomial(
@@ -301,7 +278,7 @@ def compiled_inverse_speed_of_lanes(vx: float) -> float:
 
 @compiled_internal
 def compiled_inverse_speed_slope(vx: float) -> float:
-    """dq/dvx inside compiled kernels."""
+    """Compute dq/dvx in compiled code."""
     speed = abs(vx)
     value: float = compiled_inverse_speed_slope_polynomial(
         min(speed / LOW_SPEED, 1.0), max(speed, LOW_SPEED), vx

@@ -17,7 +17,7 @@ from lpv_track_env.conditions import load as load_conditions
 from lpv_track_env.conditions.layout import ConditionsArrays
 from lpv_track_env.draws import random_key
 from lpv_track_env.observation import ObservationLayout
-from lpv_track_env.plants.episode import PlantEpisode
+from lpv_track_env.plants import PlantEpisode
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.task import Task, action_space, checked_period, reference
 from lpv_track_env.validation import check_finite, given_start, two_numbers

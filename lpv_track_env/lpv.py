@@ -1,8 +1,9 @@
 """Quasi-LPV form x' = A(x, u) x + B(u, x) u of the bicycle, exactly equal to its vector field.
 
-The entries are those of kumar2025lpv with its printing errors mended (A[vy, vy] holds Car + Caf cos
-delta; the columns of B follow u = [a, delta]). With q the inverse speed of `bicycle`, 1/vx is q and
-the direction s = vx q multiplies the steering column of B; from 1 m/s upwards q = 1/vx and s = 1.
+The entries are those of kumar2025lpv with its misprints corrected (A[vy, vy] contains
+Car + Caf cos delta; the columns of B follow u = [a, delta]). The inverse speed q of `bicycle`
+replaces 1/vx, and the direction s = vx q multiplies the steering column of B; from 1 m/s upwards
+q = 1/vx and s = 1.
 """
 
 from typing import Any
@@ -25,12 +26,13 @@ from lpv_track_env.bicycle import (
 from lpv_track_env.vehicle import VehicleParameters
 
 OUTPUTS = (VX, PSI, X, Y)
-"""The output y = C x = [vx, psi, X, Y]."""
+"""Entries of the state in the output y = C x = [vx, psi, X, Y]."""
 
 C: NDArray[np.float64] = np.eye(STATE_SIZE)[list(OUTPUTS)]
 """Output matrix, shape (4, 6)."""
 
 Entries = dict[tuple[int, int], Any]
+"""(row, column) -> value."""
 
 
 def entries(
@@ -49,7 +51,7 @@ def entries(
     car: Any,
     rolling_deceleration: Any,
 ) -> tuple[Entries, Entries]:
-    """Non-zero entries of A and B as (row, column) -> value, plain arithmetic for any backend."""
+    """Compute the non-zero entries of A and B, (row, column) -> value, for any backend."""
     direction = vx * q
     front, rear = caf * cos_delta, car
     moment = front * lf - rear * lr
@@ -81,7 +83,7 @@ def matrices(
     action: NDArray[np.float64] | Any,
     parameters: VehicleParameters,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A(x, u), shape (6, 6), and B(u), shape (6, 2), at one state (6,) and action (2,).
+    """Compute A(x, u), shape (6, 6), and B(u, x), shape (6, 2), at one state (6,) and action (2,).
 
     A x + B u equals `bicycle.derivative(x, u)` for every x and u: no linearisation error.
 
@@ -95,43 +97,28 @@ def matrices(
     if x.shape != (STATE_SIZE,) or u.shape != (ACTION_SIZE,):
         raise ValueError(f"state must be (6,) and action (2,): got {x.shape} and {u.shape}")
     vx, vy, psi, delta = x[VX], x[VY], x[PSI], u[1]
-    a_entries, b_entries = entries(
-        vx,
-        vy,
-        np.cos(psi),
-        np.sin(psi),
-        np.cos(delta),
-        np.sin(delta),
-        inverse_speed(vx),
-        *parameters.as_array(),
-    )
-    a_matrix, b_matrix = np.zeros((STATE_SIZE, STATE_SIZE)), np.zeros((STATE_SIZE, ACTION_SIZE))
-    for index, value in a_entries.items():
-        a_matrix[index] = value
-    for index, value in b_entries.items():
-        b_matrix[index] = value
+    angles = (np.cos(psi), np.sin(psi), np.cos(delta), np.sin(delta))
+    nonzero = entries(vx, vy, *angles, inverse_speed(vx), *parameters.as_array())
+    zeros = np.zeros((STATE_SIZE, STATE_SIZE)), np.zeros((STATE_SIZE, ACTION_SIZE))
+    a_matrix, b_matrix = _filled(zeros, nonzero)
     return a_matrix, b_matrix
 
 
 def casadi_matrices(state: Any, action: Any, parameters: VehicleParameters) -> tuple[Any, Any]:
-    """Return A (6, 6) and B (6, 2) as CasADi expressions of state (6, 1) and action (2, 1)."""
+    """Compute A (6, 6) and B (6, 2) as CasADi expressions of state (6, 1) and action (2, 1)."""
     import casadi as ca
 
     vx, vy, psi = state[VX], state[VY], state[PSI]
     delta = action[1]
-    a_entries, b_entries = entries(
-        vx,
-        vy,
-        ca.cos(psi),
-        ca.sin(psi),
-        ca.cos(delta),
-        ca.sin(delta),
-        casadi_inverse_speed(vx),
-        *parameters.as_array(),
-    )
-    a_matrix, b_matrix = ca.SX(STATE_SIZE, STATE_SIZE), ca.SX(STATE_SIZE, ACTION_SIZE)
-    for index, value in a_entries.items():
-        a_matrix[index] = value
-    for index, value in b_entries.items():
-        b_matrix[index] = value
-    return a_matrix, b_matrix
+    angles = (ca.cos(psi), ca.sin(psi), ca.cos(delta), ca.sin(delta))
+    nonzero = entries(vx, vy, *angles, casadi_inverse_speed(vx), *parameters.as_array())
+    zeros = ca.SX(STATE_SIZE, STATE_SIZE), ca.SX(STATE_SIZE, ACTION_SIZE)
+    return _filled(zeros, nonzero)
+
+
+def _filled(matrices: tuple[Any, Any], nonzero: tuple[Entries, Entries]) -> tuple[Any, Any]:
+    """Write entries into zero matrices A and B, and return these."""
+    for matrix, values in zip(matrices, nonzero, strict=True):
+        for index, value in values.items():
+            matrix[index] = value
+    return matrices

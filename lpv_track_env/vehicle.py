@@ -23,7 +23,7 @@ PARAMETER_ORDER = (
     "rear_cornering_stiffness",
     "rolling_deceleration",
 )
-"""Order of `VehicleParameters.as_array`, and of the last arguments of `bicycle.field`."""
+"""Order of `VehicleParameters.as_array` and of the last arguments of `bicycle.field`."""
 
 
 def _finite(value: object) -> bool:
@@ -32,46 +32,47 @@ def _finite(value: object) -> bool:
 
 @dataclass(frozen=True)
 class VehicleParameters:
-    """A single-track (bicycle) vehicle: physics, actuators and the constraints a controller keeps.
+    """A single-track (bicycle) vehicle: physics, actuators, and constraints for controllers.
 
     Parameters
     ----------
     name
         Name of the vehicle, for reports.
     source
-        Where the numbers come from.
+        Source of the numbers.
     mass
-        m, kg.
+        Mass m, kg.
     yaw_inertia
-        Iz about the centre of gravity, kg m^2.
+        Yaw inertia Iz about the centre of gravity, kg m^2.
     front_axle_distance, rear_axle_distance
-        lf, lr: centre of gravity to the axles, m.
+        Distances lf, lr of the axles from the centre of gravity, m.
     front_cornering_stiffness, rear_cornering_stiffness
-        Caf, Car: lateral force of an axle per slip angle, N/rad.
+        Cornering stiffnesses Caf, Car: lateral force of an axle per slip angle, N/rad.
     rolling_resistance
-        mu, rolling resistance coefficient (not tyre friction): `a = mu g` holds speed on the flat.
+        Coefficient mu of rolling resistance (not of tyre friction): `a = mu g` holds the speed.
     max_steering_angle
-        |delta| <= pi/6 rad (kumar2025lpv, constraint table).
+        Bound of |delta|, rad; by default pi/6 (kumar2025lpv, constraint table).
     max_steering_rate
-        rad/s; the paper's pi/300 a step at Ts 0.02 s, kept as a physical rate.
+        Bound of the steering rate, rad/s; by default the paper's pi/300 per step of Ts = 0.02 s.
     acceleration_range
-        Range of the actuator's command a, m/s^2. Wider than `longitudinal_acceleration_range`,
-        because a must also carry rolling resistance and the front tyre's drag.
+        Range of the actuator's command a, m/s^2. It is wider than
+        `longitudinal_acceleration_range`, because a must also overcome rolling resistance and the
+        front tyre's drag.
     max_jerk
-        m/s^3, bound on da/dt; the paper's 0.1 m/s^2 a step at Ts 0.02 s.
+        Bound of |da/dt|, m/s^3; by default the paper's 0.1 m/s^2 per step of Ts = 0.02 s.
     longitudinal_acceleration_range
-        Bounds of dvx/dt, m/s^2: -4 and 2 (02: the text of the paper says 2, its derived row 1).
+        Bounds of dvx/dt, m/s^2; by default -4 and 2 (the paper's text says 2, its table implies 1).
     speed_range
-        Bounds of vx that a controller keeps, m/s.
+        Bounds of vx for controllers, m/s.
     max_lateral_velocity_ratio
-        |vy| <= ratio vx; in a steady turn at low speed a limit on curvature of about ratio / lr.
+        Bound of |vy| / vx. In a steady turn at low speed it limits curvature to about ratio / lr.
     length, width
-        Body, m: for drawing, and for gaps and collisions in traffic.
+        Size of the body, m, for drawing, and for gaps and collisions in traffic.
 
     Raises
     ------
     ValueError
-        If a parameter that must be positive is not, or a range is empty or not finite.
+        If a parameter is not positive although it must be, or a range is empty or not finite.
     """
 
     name: str
@@ -118,27 +119,26 @@ class VehicleParameters:
 
     @property
     def wheelbase(self) -> float:
-        """Distance between the axles lf + lr, m."""
+        """Distance lf + lr between the axles, m."""
         return self.front_axle_distance + self.rear_axle_distance
 
     @property
     def rolling_deceleration(self) -> float:
-        """Deceleration mu g by rolling resistance, m/s^2."""
+        """Deceleration mu g caused by rolling resistance, m/s^2."""
         return self.rolling_resistance * GRAVITY
 
     @property
     def understeer_gradient(self) -> float:
-        """Steering angle that a steady turn needs beyond L kappa, per lateral acceleration.
+        """Steering angle beyond L kappa in a steady turn, per lateral acceleration, rad s^2/m.
 
-        K = m (lr Car - lf Caf) / (L Caf Car), rad s^2/m (Rajamani, Vehicle Dynamics and Control,
-        section 3.3).
+        K = m (lr Car - lf Caf) / (L Caf Car) (Rajamani, Vehicle Dynamics and Control, section 3.3).
         """
         caf, car = self.front_cornering_stiffness, self.rear_cornering_stiffness
         lf, lr = self.front_axle_distance, self.rear_axle_distance
         return self.mass * (lr * car - lf * caf) / (self.wheelbase * caf * car)
 
     def as_array(self) -> NDArray[np.float64]:
-        """Physical parameters, shape (7,), in `PARAMETER_ORDER`, as compiled kernels take them."""
+        """Physical parameters in `PARAMETER_ORDER`, shape (7,), for compiled kernels."""
         return np.array([getattr(self, name) for name in PARAMETER_ORDER])
 
     def replace(self, **changes: object) -> "VehicleParameters":
@@ -146,7 +146,7 @@ class VehicleParameters:
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values for JSON."""
+        """Parameters as plain values for JSON."""
         return dataclasses.asdict(self)
 
 
@@ -185,7 +185,7 @@ M2_MINIBUS = VehicleParameters(
 )
 
 TYRE_STIFFNESS_PER_LOAD = 21.92
-"""1/rad, -p_ky1 of the tyre in CommonRoad's manual (Tab. 7), the slope of its Pacejka curve."""
+"""1/rad: -p_ky1 of the tyre in CommonRoad's manual (Tab. 7), the slope of its Pacejka curve."""
 
 
 def _commonroad(
@@ -200,11 +200,11 @@ def _commonroad(
     length: float,
     width: float,
 ) -> VehicleParameters:
-    """Vehicle of CommonRoad's manual, its tyres linearised at no slip and their static loads.
+    """Make a vehicle of CommonRoad's manual, with tyres linearised at zero slip and static load.
 
-    At small slip an axle's lateral force is C_S mu Fz = -p_ky1 Fz per rad, in the single-track
-    model (C_S = -p_ky1 / p_dy1, mu = p_dy1) and as the slope of the Pacejka curve alike; the loads
-    are Fzf = m g lr / L, Fzr = m g lf / L. So Caf lf = Car lr: these vehicles steer neutrally. The
+    At small slip an axle's lateral force is C_S mu Fz = -p_ky1 Fz per rad, both in the single-track
+    model (C_S = -p_ky1 / p_dy1, mu = p_dy1) and as the slope of the Pacejka curve. The loads are
+    Fzf = m g lr / L and Fzr = m g lf / L, so Caf lf = Car lr: these vehicles steer neutrally. The
     models have no rolling resistance.
     """
     stiffness = TYRE_STIFFNESS_PER_LOAD * mass * GRAVITY
@@ -273,7 +273,7 @@ VEHICLES: dict[str, VehicleParameters] = {
 
 
 def load(vehicle: str | Path | VehicleParameters) -> VehicleParameters:
-    """Resolve a preset's name, a JSON file of parameters, or parameters themselves.
+    """Return the vehicle of a preset's name or of a JSON file; parameters are returned as they are.
 
     Raises
     ------

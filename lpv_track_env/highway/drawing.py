@@ -8,7 +8,7 @@ from highway_env.road.road import RoadNetwork
 from highway_env.vehicle.objects import RoadObject
 from numpy.typing import NDArray
 
-from lpv_track_env.rendering.scenery import Scenery
+from lpv_track_env.rendering.track import Scenery
 
 Array = NDArray[np.float64]
 

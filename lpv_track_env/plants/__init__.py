@@ -1,8 +1,8 @@
-"""Plants: what moves under an agent's commands.
+"""Plants: the models that an environment simulates under an agent's commands.
 
-The environment's own is the dynamic bicycle of its compiled kernels, `bicycle`: the very model
-that the NMPC predicts with. The others are vehicles that nobody here modelled, so that an agent is
-also tested on physics that its model does not have:
+The default is `bicycle`, the dynamic bicycle of the compiled kernels, with which the NMPC predicts,
+too. The others are independent models of other authors: they test an agent on physics that its own
+model does not contain.
 
 ============  ==========================================================================
 name          plant
@@ -13,17 +13,20 @@ drift         CommonRoad's drift single-track: Pacejka tyres, two spinning wheel
 multi-body    CommonRoad's multi-body model: suspension, four tyres, 29 states
 ============  ==========================================================================
 
-A plant follows `Plant`. Its commands have passed the actuators of the environment, which clip
-range and rate alike for every plant.
+A plant implements `Plant`. It receives the commands after the actuators of the environment, which
+clip range and rate in the same way for every plant.
 """
 
 import importlib
+import math
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lpv_track_env import kernels
+from lpv_track_env.conditions import episode as conditions_episode
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.naming import choose
 
@@ -31,7 +34,7 @@ Array = NDArray[np.float64]
 
 
 class Plant(Protocol):
-    """A vehicle's motion over control periods; it keeps its own, possibly larger, state."""
+    """Model of a vehicle's motion over control periods; it keeps a state of its own."""
 
     def begin(self, state: Array, steering_angle: float) -> None:
         """Start an episode.
@@ -51,16 +54,16 @@ class Plant(Protocol):
         Parameters
         ----------
         acceleration
-            Command a as in `bicycle`, m/s^2: rolling resistance is still to be taken off.
+            Command a as in `bicycle`, m/s^2, before rolling resistance.
         steering_angle
-            What the steering actuator brings the front wheels to, rad.
+            Angle of the front wheels after the steering actuator, rad.
         period
             s.
 
         Returns
         -------
         NDArray
-            State as in `begin`, shape (6,), not finite if the model broke down.
+            State as in `begin`, shape (6,); not finite if the model broke down.
 
         Raises
         ------
@@ -71,7 +74,7 @@ class Plant(Protocol):
 
 
 Factory = Callable[[VehicleParameters], Plant]
-"""What makes a vehicle's plant: for instance, the plant's class."""
+"""A function that makes the plant of a vehicle, for instance the plant's class."""
 
 BICYCLE = "bicycle"
 """The plant of the compiled kernels."""
@@ -90,17 +93,15 @@ def names() -> tuple[str, ...]:
 
 
 def make(plant: str | Factory, vehicle: VehicleParameters) -> Plant | None:
-    """Make a vehicle's plant by its name or by what makes it; None for `bicycle`.
-
-    The bicycle is in the kernels, and stays there.
+    """Make a vehicle's plant by its name or factory; None for `bicycle`, which the kernels contain.
 
     Raises
     ------
     ValueError
-        For an unknown name (the message lists the known ones and the nearest), or a vehicle that
-        the plant has no parameters for.
+        For an unknown name (the message lists the known ones and the nearest), or a vehicle for
+        which the plant has no parameters.
     ModuleNotFoundError
-        If the plant needs a package that is not installed, with how to install it.
+        If the plant needs a package that is not installed; the message says how to install it.
     """
     if not isinstance(plant, str):
         return plant(vehicle)
@@ -109,3 +110,50 @@ def make(plant: str | Factory, vehicle: VehicleParameters) -> Plant | None:
     module, _, attribute = PLANTS[plant].partition(":")
     factory: Factory = getattr(importlib.import_module(module), attribute)
     return factory(vehicle)
+
+
+class PlantEpisode:
+    """Control periods of an environment whose plant is not the kernels' bicycle.
+
+    Parameters
+    ----------
+    plant
+        The plant. The kernels still compute the actuators before it, and errors, reward and end of
+        the episode after it.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+
+    def begin(self, record: Array) -> None:
+        """Start the plant at the state and steering angle of an episode's record."""
+        self.plant.begin(record[:6].copy(), float(record[kernels.STEERING]))
+
+    def advance(self, episode: Array, table: Array, *conditioned: Any) -> tuple[float, ...]:
+        """Drive one control period in place of `kernels.advance`, with its arguments and result.
+
+        Under conditions these are the arguments of `advance_under_conditions`. Conditions of
+        sensors, actuators and commands hold for every plant, but mass, tyres and wind are the
+        plant's own.
+        """
+        end = kernels.NOT_FINITE
+        if math.isfinite(episode[0]) and math.isfinite(episode[1]):
+            if conditioned:
+                vehicle, spec = conditioned[:2]
+                a, delta, bits = conditions_episode.command_under_conditions(episode, vehicle, spec)
+            else:
+                a, delta, bits = kernels.command(episode)
+            period = float(episode[kernels.CONSTANTS + kernels.PERIOD])
+            try:
+                state = np.asarray(self.plant.advance(a, delta, period), dtype=np.float64)
+            except (ArithmeticError, ValueError):
+                state = np.full(6, np.nan)
+            if conditioned:
+                given: Any = (episode, table, *conditioned, state, bits)
+                end = conditions_episode.conclude_under_conditions(*given)
+            else:
+                vx, vy, psi, r, x, y = state.tolist()
+                end = kernels.conclude(episode, table, vx, vy, psi, r, x, y, a, delta, bits)
+        results = episode[kernels.RECORD : kernels.CONSTANTS].tolist()[kernels.ARC_LENGTH :]
+        clipped = kernels.CLIPPED - kernels.ARC_LENGTH
+        return end, *results[:clipped], int(results[clipped]), *results[clipped + 1 :]

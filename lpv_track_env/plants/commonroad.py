@@ -1,40 +1,42 @@
-"""CommonRoad's vehicle models as plants: the package `commonroad-vehicle-models`, extra `plants`.
+"""CommonRoad's vehicle models as plants, from `commonroad-vehicle-models` (the extra `plants`).
 
 M. Althoff, G. Würsching, "CommonRoad: Vehicle Models", 2020. The models are the package's own
-functions f(x, u, p), compiled as they stand; parameters are the package's for the vehicle's name.
-Their state order is [X, Y, delta, speed, psi, r, ...], their inputs are the steering rate and an
-acceleration. What lies between them and the environment:
+functions f(x, u, p), compiled unchanged, with the package's parameters for the vehicle's name.
+Their state is [X, Y, delta, speed, psi, r, ...], their inputs are the steering rate and an
+acceleration. They are connected to the environment as follows:
 
 Reference point
-    Centre of gravity; of the multi-body, that of its sprung mass, as its axle distances are. It
-    sways with the body's roll.
+    The centre of gravity; of the multi-body, the one of its sprung mass, to which its axle
+    distances refer, too. It sways with the body's roll.
 Steering
-    The rate that brings the front wheels within the period to where the steering actuator is: so
-    the angle arrives at the period's end, and on the way lags behind that of `bicycle`, which the
-    kernels hold from the period's start, by half a period on average. The actuator's limit of rate
-    guarantees that the rate can be had. Limits of the angle and its rate are the environment's.
+    The rate that turns the front wheels to the steering actuator's angle within the period. So the
+    angle is reached at the period's end. On the way it lags, by half a period on average, behind
+    the angle of `bicycle`, which the kernels hold from the period's start. The actuator's rate
+    limit guarantees that the rate is feasible. Limits of angle and rate are the environment's.
 Acceleration
-    a - mu g (in the direction of travel): the models have no rolling resistance of their own. To
-    the single-track it is the rate of change of the speed, without the tyres' drag in a turn; to
-    the other two it is a torque m R_w a on the wheels, so that slip, the front tyres' drag and the
-    wheels' own inertia (2.6 % of the BMW's mass in `drift`, 5.3 % in `multi-body`) come off it. All
-    of them limit it to the engine's power, a_max v_switch / v.
+    a - mu g (in the direction of travel): the models have no rolling resistance. For the
+    single-track it is the rate of change of the speed, without the tyres' drag in a turn. For the
+    other two it is a torque m R_w a on the wheels, reduced by slip, by the front tyres' drag and by
+    the wheels' inertia (2.6 % of the BMW's mass in `drift`, 5.3 % in `multi-body`). All three limit
+    it to the engine's power, a_max v_switch / v.
 Speed
-    Forwards only: brakes hold at standstill (v_min is 0), for in reverse the single-track's tyres
-    push where they should damp, and the multi-body divides by zero. Below 0.1 m/s (drift: 0.2 m/s)
-    the models pass to a kinematic one, abruptly but for the drift model.
+    Forwards only: brakes hold at standstill (v_min is 0), because in reverse the tyres of the
+    single-track push where they should damp, and the multi-body divides by zero. Below 0.1 m/s
+    (drift: 0.2 m/s) the models switch to a kinematic one, abruptly except for the drift model.
 Left and right
-    The Pacejka tyre's data are not symmetric: r_vy1, r_by3, r_hx1 push to one side. Camber shifts a
-    tyre's curve by p_hy1 and p_vy1 with its sign, however small it is: in the multi-body, whose
-    wheels lean with its roll, side forces jump by 2 % of the load each way as a wheel's camber goes
-    through zero. There integration converges at first order only.
+    The data of the Pacejka tyre are not symmetric: r_vy1, r_by3, r_hx1 push to one side. Camber,
+    however small, shifts a tyre's curve by p_hy1 and p_vy1 with its sign. In the multi-body, whose
+    wheels lean with its roll, side forces jump by 2 % of the load each way when a wheel's camber
+    passes zero; there the integration converges with first order only.
 """
 
+import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from types import FunctionType, ModuleType
 from typing import Any
 
 import numba
@@ -42,7 +44,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, inverse_speed
-from lpv_track_env.plants.recompiled import recompiled
 from lpv_track_env.vehicle import (
     BMW_320I,
     FORD_ESCORT,
@@ -71,19 +72,74 @@ except ModuleNotFoundError as error:
 Array = NDArray[np.float64]
 
 VEHICLE_IDS = {FORD_ESCORT.name: 1, BMW_320I.name: 2, VW_VANAGON.name: 3}
-"""CommonRoad's number of each vehicle that all three models have parameters for."""
+"""CommonRoad's numbers of the vehicles for which all three models have parameters."""
 
 POSITION_X, POSITION_Y, STEERING, SPEED, HEADING, RATE, SIDESLIP = range(7)
-"""Entries of every model's state; of the multi-body, SPEED is vx, SIDESLIP is its roll angle."""
+"""Entries of every model's state; in the multi-body, SPEED is vx and SIDESLIP the roll angle."""
 LATERAL_SPEED = 10
-"""Entry of the multi-body's state."""
+"""Entry of the multi-body's state, vy."""
 
 MODELS = Path(vehiclemodels.__file__).parent
+"""Folder of the package's sources."""
 
 POLE_STEP = 1.0
 """Largest product of an integration step and a model's fastest pole; RK4 is stable up to 2.78."""
 SLOWEST = 0.1
-"""m/s; below, slips are taken relative to this speed (drift) or not at all."""
+"""m/s; below it, slips are relative to this speed (drift) or not computed at all."""
+
+
+def recompiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function of another package, and the functions of that package that it calls.
+
+    numba compiles a call only if the called function is compiled itself. So each function is bound
+    anew, its code unchanged, to globals that contain the compiled functions.
+
+    Parameters
+    ----------
+    function
+        A plain function of numbers, arrays and lists of floats. So are the functions that it calls,
+        by their names or as attributes of modules.
+    """
+    compiled: Callable[..., Any] = _Recompiler(_package(function.__module__)).function(function)
+    return compiled
+
+
+def _package(module: str) -> str:
+    return module.partition(".")[0]
+
+
+class _Recompiler:
+    """Bind each function and each module of a package once."""
+
+    def __init__(self, package: str) -> None:
+        self.package = package
+        self.known: dict[Any, Any] = {}
+
+    def function(self, function: Any) -> Any:
+        if function not in self.known:
+            code = function.__code__
+            bound = FunctionType(code, self.bindings(function.__globals__, code.co_names))
+            self.known[function] = compiled_with_lists()(bound)
+        return self.known[function]
+
+    def module(self, module: ModuleType) -> ModuleType:
+        if module not in self.known:
+            bound = ModuleType(module.__name__)
+            bound.__dict__.update(self.bindings(vars(module), tuple(vars(module))))
+            self.known[module] = bound
+        return self.known[module]  # type: ignore[no-any-return]
+
+    def bindings(self, names: dict[str, Any], used: tuple[str, ...]) -> dict[str, Any]:
+        """Copy global names; replace used functions and modules of the package by compiled ones."""
+        bound = dict(names)
+        for name in used:
+            value = names.get(name)
+            if inspect.isfunction(value) and _package(value.__module__) == self.package:
+                bound[name] = self.function(value)
+            elif inspect.ismodule(value) and _package(value.__name__) == self.package:
+                bound[name] = self.module(value)
+        return bound
+
 
 single_track_field = recompiled(vehicle_dynamics_st)
 drift_field = recompiled(vehicle_dynamics_std)
@@ -92,7 +148,7 @@ multi_body_field = recompiled(vehicle_dynamics_mb)
 
 @compiled_with_lists(MODELS)
 def ahead(x: Array, rate: list[float], h: float) -> Array:
-    """State h seconds on, at a constant rate of change."""
+    """State after h seconds at a constant rate of change."""
     y = x.copy()
     for k in range(x.size):
         y[k] += h * rate[k]
@@ -101,7 +157,7 @@ def ahead(x: Array, rate: list[float], h: float) -> Array:
 
 @compiled_with_lists(MODELS)
 def combine(x: Array, h: float, k1: Any, k2: Any, k3: Any, k4: Any) -> None:
-    """End a Runge-Kutta step (classic, order 4) of h seconds, in place."""
+    """Complete a classic Runge-Kutta step (order 4) of h seconds, in place."""
     for k in range(x.size):
         x[k] += h / 6.0 * (k1[k] + 2.0 * (k2[k] + k3[k]) + k4[k])
 
@@ -140,13 +196,13 @@ def drive_multi_body(x: Array, u: tuple[float, float], p: Any, h: float, steps: 
 
 
 class CommonRoadPlant(ABC):
-    """What the three have in common.
+    """Common base of the three plants.
 
     Parameters
     ----------
     vehicle
-        One of `VEHICLE_IDS`, with the physical parameters of its preset (actuators' limits and
-        rolling resistance may differ).
+        One of `VEHICLE_IDS`, with the physical parameters of its preset (limits of the actuators
+        and rolling resistance may differ).
 
     Raises
     ------
@@ -157,7 +213,7 @@ class CommonRoadPlant(ABC):
     integrate: Callable[..., None]
     """Take Runge-Kutta steps (x, inputs, parameters, h, steps) in place."""
     longest_step: float
-    """s; what the model's motion, beside its fastest pole, asks for."""
+    """Longest integration step, s, where the fastest pole does not require a shorter one."""
 
     def __init__(self, vehicle: VehicleParameters) -> None:
         self.rolling_deceleration = vehicle.rolling_deceleration
@@ -174,7 +230,7 @@ class CommonRoadPlant(ABC):
 
     @abstractmethod
     def fastest_pole(self, speed: float) -> float:
-        """Bound of the model's fastest pole at a speed in m/s (at least SLOWEST), 1/s."""
+        """Upper bound of the model's fastest pole, 1/s, at a speed (m/s) of at least SLOWEST."""
 
     def advance(self, acceleration: float, steering_angle: float, period: float) -> Array:
         """Drive one control period; see `Plant`."""
@@ -186,7 +242,7 @@ class CommonRoadPlant(ABC):
         return self.state()
 
     def steps(self, acceleration: float, period: float) -> int:
-        """Integration steps of a control period, by the slowest speed that it comes to."""
+        """Number of integration steps of a control period, from the lowest speed in it."""
         slowest = abs(float(self.x[SPEED])) - abs(acceleration) * period
         pole = self.fastest_pole(max(slowest, SLOWEST))
         return math.ceil(period / min(self.longest_step, POLE_STEP / pole))
@@ -201,10 +257,10 @@ class CommonRoadPlant(ABC):
 
 
 class _OneTrack(CommonRoadPlant):
-    """State of the two single-track models: speed along the direction of travel, and sideslip."""
+    """Base of the two single-track models: their state holds total speed and sideslip."""
 
     def core(self, state: Array, steering_angle: float) -> list[float]:
-        """First seven entries of the models' states."""
+        """Return the first seven entries of the model's state."""
         vx, vy = float(state[VX]), float(state[VY])
         forwards = math.copysign(1.0, vx)
         return [
@@ -223,7 +279,7 @@ class _OneTrack(CommonRoadPlant):
         return speed * math.cos(sideslip), speed * math.sin(sideslip)
 
     def tyre_pole(self, speed: float) -> float:
-        """Sum of the lateral dynamics' damping rates, 1/s: no smaller than its fastest pole."""
+        """Sum of the damping rates of the lateral dynamics, 1/s: at least its fastest pole."""
         p = self.parameters
         return float(-p.tire.p_ky1 * GRAVITY * (1.0 + p.m * p.a * p.b / p.I_z) / speed)
 
@@ -239,7 +295,7 @@ class SingleTrack(_OneTrack):
         self.x = np.array(self.core(state, steering_angle))
 
     def fastest_pole(self, speed: float) -> float:
-        """Bound of the fastest pole, the tyres', 1/s."""
+        """Upper bound of the fastest pole, which the tyres cause, 1/s."""
         return self.tyre_pole(speed)
 
 
@@ -254,7 +310,7 @@ class Drift(_OneTrack):
         self.x = np.array(init_std(self.core(state, steering_angle), self.parameters))
 
     def fastest_pole(self, speed: float) -> float:
-        """Bound of the fastest pole, mostly that of a wheel's spin, 1/s."""
+        """Upper bound of the fastest pole, mostly of a wheel's spin, 1/s."""
         p = self.parameters
         load = p.m * GRAVITY * max(p.a, p.b) / (p.a + p.b)
         spin = float(p.R_w**2 * p.tire.p_kx1 * load / (p.I_y_w * speed))
@@ -279,7 +335,7 @@ class MultiBody(CommonRoadPlant):
         return float(self.x[SPEED]), float(self.x[LATERAL_SPEED])
 
     def fastest_pole(self, speed: float) -> float:
-        """Bound of the fastest pole: a wheel's spin, or the roll of an axle on its tyres, 1/s."""
+        """Upper bound of the fastest pole, a wheel's spin or an axle's roll on its tyres, 1/s."""
         p = self.parameters
         load = p.m * GRAVITY * max(p.a, p.b) / (p.a + p.b)
         spin = p.R_w**2 * p.tire.p_kx1 * 0.5 * load / (p.I_y_w * speed)
@@ -288,9 +344,9 @@ class MultiBody(CommonRoadPlant):
 
 
 def parameters_of(vehicle: VehicleParameters) -> Any:
-    """The package's parameters of a vehicle as a `numpy.record`, which compiled code reads too.
+    """Return the package's parameters of a vehicle as a `numpy.record`, for compiled code.
 
-    Limits of the steering are the vehicle's own, for its actuator has kept to them.
+    The steering limits are those of `vehicle`, which its actuator has already applied.
 
     Raises
     ------
@@ -314,14 +370,14 @@ def parameters_of(vehicle: VehicleParameters) -> Any:
     given.steering.min, given.steering.v_min = -given.steering.max, -given.steering.v_max
     given.longitudinal.v_min = 0.0
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-        # To plain Python `min` and `max` of a record are its methods.
+        # In plain Python `min` and `max` of a record would be its methods.
         return given
     layout, values = _as_record(given)
     return np.array([values], dtype=layout)[0]
 
 
 def _as_record(given: Any) -> tuple[np.dtype[Any], tuple[Any, ...]]:
-    """Layout and values of a nested dataclass's numbers; what is None is left out."""
+    """Layout and values of the numbers in a nested dataclass; None is left out."""
     layout: list[tuple[str, Any]] = []
     values: list[Any] = []
     for field in fields(given):

@@ -1,8 +1,7 @@
-"""Drawing of path tracking with pygame: frames as arrays, or a window; see `renderer`."""
+"""Drawing of path tracking with pygame, as arrays or in a window; see `renderer`."""
 
+from lpv_track_env.rendering.canvas import HEIGHT, WIDTH
 from lpv_track_env.rendering.renderer import Renderer
-from lpv_track_env.rendering.scenery import Scenery
-from lpv_track_env.rendering.style import HEIGHT, WIDTH
-from lpv_track_env.rendering.track import COLOURINGS
+from lpv_track_env.rendering.track import COLOURINGS, Scenery
 
 __all__ = ["COLOURINGS", "HEIGHT", "WIDTH", "Renderer", "Scenery"]

@@ -1,4 +1,4 @@
-"""Cards on the scene: what is driven, what the agent does, the map, the key."""
+"""Cards on the scene: the task, the agent's notes, the end, the scale and the key."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,26 +8,9 @@ import pygame
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels
-from lpv_track_env.rendering.forces import AxleForces
-from lpv_track_env.rendering.style import (
-    ALERT,
-    FAINT,
-    GRID,
-    INK,
-    MARGIN,
-    PADDING,
-    PLAN,
-    SCENE_HEIGHT,
-    SUPERSAMPLING,
-    TRACE,
-    TRAIL,
-    WIDTH,
-    Type,
-    card,
-    signed,
-)
-from lpv_track_env.rendering.vehicles import arrow
-from lpv_track_env.rendering.view import Colour, View
+from lpv_track_env.rendering import canvas
+from lpv_track_env.rendering.canvas import SUPERSAMPLING, Colour, Letters, View
+from lpv_track_env.rendering.vehicles import AxleForces, arrow
 from lpv_track_env.task import Task
 from trajectories import CurvatureBands
 
@@ -36,42 +19,42 @@ Array = NDArray[np.float64]
 CARD_WIDTH, ROW = 224, 17
 """Pixels of the frame."""
 LABEL, NOTE_LABEL = 66, 54
-"""Pixels of a row's label, of ours and of an agent's; its value follows."""
+"""Pixels of a row's label on the task's card, and on the card of the agent's notes."""
 MOST_NOTES = 9
-"""Rows of an agent's card: more would reach the charts."""
+"""Largest number of rows on the card of notes: more would reach the charts."""
 BANDS = CurvatureBands()
 
 
 class Cards:
-    """The words on an episode's frames.
+    """The cards of an episode's frames.
 
     Parameters
     ----------
     task
-        What is driven.
+        Path, vehicle and limits of the episode.
     letters
-        To write with.
+        Renderer of text.
     """
 
-    def __init__(self, task: Task, letters: Type) -> None:
+    def __init__(self, task: Task, letters: Letters) -> None:
         self._task, self._letters = task, letters
         self._curvature = np.abs(task.path.curvature)
-        self._blank = card(CARD_WIDTH, 2 * PADDING + 5 * ROW + 1)
+        self._blank = canvas.card(CARD_WIDTH, 2 * canvas.PADDING + 5 * ROW + 1)
         self._notes: tuple[Mapping[str, str], pygame.Surface] | None = None
         self._scale: tuple[int, pygame.Surface] | None = None
         self._title = f"{task.path.name} · {task.vehicle.name}"
 
     def draw_task(self, surface: pygame.Surface, record: Array, forces: AxleForces) -> int:
-        """Draw what is driven, how far, and in which band; returns the card's lower end."""
-        scale, left = SUPERSAMPLING, SUPERSAMPLING * (MARGIN + PADDING)
-        surface.blit(self._blank, (scale * MARGIN, scale * MARGIN))
-        top = scale * (MARGIN + PADDING - 2)
-        title = self._letters.fitted(self._title, CARD_WIDTH - 2 * PADDING, INK, 12, bold=True)
+        """Draw path, vehicle, progress and curvature band; return the lower end of the card."""
+        scale, left = SUPERSAMPLING, SUPERSAMPLING * (canvas.MARGIN + canvas.PADDING)
+        surface.blit(self._blank, (scale * canvas.MARGIN, scale * canvas.MARGIN))
+        top = scale * (canvas.MARGIN + canvas.PADDING - 2)
+        room = CARD_WIDTH - 2 * canvas.PADDING
+        title = self._letters.fitted(self._title, room, canvas.INK, 12, bold=True)
         surface.blit(title, (left, top))
         top += scale * (ROW + 4)
-        self._row(
-            surface, top, "time", f"{record[kernels.STEPS] * self._task.control_period:.2f} s"
-        )
+        time = record[kernels.STEPS] * self._task.control_period
+        self._row(surface, top, "time", f"{time:.2f} s")
         top += scale * ROW
         s, length = float(record[kernels.ARC_LENGTH]), self._task.path.length
         share = (s - float(record[kernels.START]) * self._task.path.closed) / length
@@ -85,103 +68,103 @@ class Cards:
         self._row(surface, top, "curvature", f"{BANDS.names[band]}")
         self._steps(surface, top, band)
         top += scale * ROW
-        front, rear = (
-            signed(math.degrees(slip), 1) for slip in (forces.front_slip, forces.rear_slip)
-        )
+        slips = (forces.front_slip, forces.rear_slip)
+        front, rear = (canvas.signed(math.degrees(slip), 1) for slip in slips)
         self._row(surface, top, "slip angles", f"{front}° front, {rear}° rear")
-        return MARGIN + self._blank.get_height() // scale
+        return canvas.MARGIN + self._blank.get_height() // scale
 
     def draw_end(self, surface: pygame.Surface, end: int) -> None:
-        """Draw how the episode has ended, over the middle of the scene."""
+        """Draw how the episode ended, at the top of the scene."""
         if end == kernels.RUNNING:
             return
-        colour = INK if end == kernels.FINISHED else ALERT
+        colour = canvas.INK if end == kernels.FINISHED else canvas.ALERT
         text = self._letters.render(kernels.END_NAMES[end].replace("_", " "), colour, 16, bold=True)
-        banner = card(text.get_width() / SUPERSAMPLING + 4 * PADDING, 36)
-        place = (SUPERSAMPLING * WIDTH - banner.get_width()) // 2
+        banner = canvas.card(text.get_width() / SUPERSAMPLING + 4 * canvas.PADDING, 36)
+        place = (SUPERSAMPLING * canvas.WIDTH - banner.get_width()) // 2
         banner.blit(text, text.get_rect(center=banner.get_rect().center))
-        surface.blit(banner, (place, SUPERSAMPLING * MARGIN))
+        surface.blit(banner, (place, SUPERSAMPLING * canvas.MARGIN))
 
     def draw_notes(self, surface: pygame.Surface, notes: Mapping[str, str], top: int) -> None:
-        """Draw what an agent tells, a row an entry, below `top`."""
+        """Draw the agent's notes below `top`, one row for each."""
         if not notes:
             return
         if self._notes is None or self._notes[0] != notes:
             rows = list(notes.items())[:MOST_NOTES]
-            panel = card(CARD_WIDTH, 2 * PADDING + ROW * len(rows) - 3)
+            panel = canvas.card(CARD_WIDTH, 2 * canvas.PADDING + ROW * len(rows) - 3)
             for k, (label, value) in enumerate(rows):
-                at = SUPERSAMPLING * (PADDING + ROW * k - 2)
-                word = self._letters.fitted(label, NOTE_LABEL - 4, FAINT, 11)
-                panel.blit(word, (SUPERSAMPLING * PADDING, at))
-                room = CARD_WIDTH - 2 * PADDING - NOTE_LABEL
+                at = SUPERSAMPLING * (canvas.PADDING + ROW * k - 2)
+                word = self._letters.fitted(label, NOTE_LABEL - 4, canvas.FAINT, 11)
+                panel.blit(word, (SUPERSAMPLING * canvas.PADDING, at))
+                room = CARD_WIDTH - 2 * canvas.PADDING - NOTE_LABEL
                 panel.blit(
-                    self._letters.fitted(value, room, INK, 11),
-                    (SUPERSAMPLING * (PADDING + NOTE_LABEL), at),
+                    self._letters.fitted(value, room, canvas.INK, 11),
+                    (SUPERSAMPLING * (canvas.PADDING + NOTE_LABEL), at),
                 )
             self._notes = (dict(notes), panel)
-        place = (SUPERSAMPLING * MARGIN, SUPERSAMPLING * (top + MARGIN // 2))
+        place = (SUPERSAMPLING * canvas.MARGIN, SUPERSAMPLING * (top + canvas.MARGIN // 2))
         surface.blit(self._notes[1], place)
 
     def draw_scale(self, surface: pygame.Surface, view: View) -> None:
-        """Draw a bar of round length, between 60 and 150 pixels."""
+        """Draw a scale: a bar of a round length, 60 to 150 pixels long."""
         scale = view.scale / SUPERSAMPLING
         length = next(m for m in (2.0, 5.0, 10.0, 20.0) if m * scale >= 60.0 or m == 20.0)
-        wide, left = round(length * view.scale), SUPERSAMPLING * PADDING
+        wide, left = round(length * view.scale), SUPERSAMPLING * canvas.PADDING
         if self._scale is None or self._scale[0] != wide:
-            panel = card(wide / SUPERSAMPLING + 2 * PADDING, 34)
+            panel = canvas.card(wide / SUPERSAMPLING + 2 * canvas.PADDING, 34)
             base = SUPERSAMPLING * 24
-            pygame.draw.line(panel, INK, (left, base), (left + wide, base), 3)
+            pygame.draw.line(panel, canvas.INK, (left, base), (left + wide, base), 3)
             for end in (left, left + wide):
-                pygame.draw.line(panel, INK, (end, base - 7), (end, base + 7), 3)
-            label = self._letters.render(f"{length:g} m", INK, 10)
+                pygame.draw.line(panel, canvas.INK, (end, base - 7), (end, base + 7), 3)
+            label = self._letters.render(f"{length:g} m", canvas.INK, 10)
             panel.blit(label, (left + (wide - label.get_width()) // 2, base - 34))
             self._scale = (wide, panel)
-        bottom = SUPERSAMPLING * (SCENE_HEIGHT - MARGIN)
+        bottom = SUPERSAMPLING * (canvas.SCENE_HEIGHT - canvas.MARGIN)
         panel = self._scale[1]
-        surface.blit(panel, (SUPERSAMPLING * MARGIN, bottom - panel.get_height()))
+        surface.blit(panel, (SUPERSAMPLING * canvas.MARGIN, bottom - panel.get_height()))
 
     def _row(self, surface: pygame.Surface, top: int, label: str, value: str) -> None:
-        left = SUPERSAMPLING * (MARGIN + PADDING)
-        surface.blit(self._letters.render(label, FAINT, 11), (left, top))
-        room = CARD_WIDTH - 2 * PADDING - LABEL
-        text = self._letters.fitted(value, room, INK, 11)
+        left = SUPERSAMPLING * (canvas.MARGIN + canvas.PADDING)
+        surface.blit(self._letters.render(label, canvas.FAINT, 11), (left, top))
+        room = CARD_WIDTH - 2 * canvas.PADDING - LABEL
+        text = self._letters.fitted(value, room, canvas.INK, 11)
         surface.blit(text, (left + SUPERSAMPLING * LABEL, top))
 
     def _bar(self, surface: pygame.Surface, top: int, share: float) -> None:
-        """A bar at a row's right end, filled by a share."""
+        """Draw a bar at the right end of a row, filled to a share."""
         left, width, height = self._right(44), SUPERSAMPLING * 44, SUPERSAMPLING * 5
-        top += SUPERSAMPLING * 5
-        pygame.draw.rect(surface, GRID, (left, top, width, height), border_radius=height // 2)
+        top, radius = top + SUPERSAMPLING * 5, height // 2
+        pygame.draw.rect(surface, canvas.GRID, (left, top, width, height), border_radius=radius)
         if share > 0.0:
             filled = max(round(width * share), height)
-            pygame.draw.rect(surface, TRACE, (left, top, filled, height), border_radius=height // 2)
+            box = (left, top, filled, height)
+            pygame.draw.rect(surface, canvas.TRACE, box, border_radius=radius)
 
     def _steps(self, surface: pygame.Surface, top: int, band: int) -> None:
-        """Four fields at a row's right end, those up to the band filled."""
+        """Draw one field for each band at the right end of a row, filled up to `band`."""
         left, wide = self._right(44), SUPERSAMPLING * 44 // len(BANDS)
         top += SUPERSAMPLING * 5
         for k in range(len(BANDS)):
             box = (left + k * wide, top, wide - SUPERSAMPLING * 2, SUPERSAMPLING * 5)
-            pygame.draw.rect(surface, TRACE if k <= band else GRID, box)
+            pygame.draw.rect(surface, canvas.TRACE if k <= band else canvas.GRID, box)
 
     @staticmethod
     def _right(width: int) -> int:
-        """Left end of what ends at a card's right, pixels of the supersampled frame."""
-        return SUPERSAMPLING * (MARGIN + CARD_WIDTH - PADDING - width)
+        """Left end of a drawing at a card's right end, pixels of the supersampled frame."""
+        return SUPERSAMPLING * (canvas.MARGIN + CARD_WIDTH - canvas.PADDING - width)
 
 
-def make_key(letters: Type, shown: Sequence[str]) -> pygame.Surface:
-    """A card that says what lines and arrows mean: of "driven", "plan", "tyre forces"."""
+def make_legend(letters: Letters, shown: Sequence[str]) -> pygame.Surface:
+    """Make a card that explains lines and arrows: "driven", "plan", "tyre forces"."""
     scale = SUPERSAMPLING
-    words = [letters.render(word, FAINT, 10) for word in shown]
+    words = [letters.render(word, canvas.FAINT, 10) for word in shown]
     widths = [word.get_width() + scale * 26 for word in words]
-    key = card((sum(widths) + scale * (8 + 8 * (len(words) - 1))) / scale, 22)
+    legend = canvas.card((sum(widths) + scale * (8 + 8 * (len(words) - 1))) / scale, 22)
     x, middle = 8 * scale, 11 * scale
     for name, word, width in zip(shown, words, widths, strict=True):
-        _glyph(key, name, x, middle)
-        key.blit(word, (x + scale * 20, middle - word.get_height() // 2))
+        _glyph(legend, name, x, middle)
+        legend.blit(word, (x + scale * 20, middle - word.get_height() // 2))
         x += width + 8 * scale
-    return key
+    return legend
 
 
 def _glyph(surface: pygame.Surface, name: str, x: int, y: int) -> None:
@@ -189,7 +172,7 @@ def _glyph(surface: pygame.Surface, name: str, x: int, y: int) -> None:
     if name == "tyre forces":
         arrow(surface, np.array([x, y], dtype=float), np.array([x + 16.0 * scale, y]))
         return
-    colour: Colour = PLAN if name == "plan" else TRAIL
+    colour: Colour = canvas.PLAN if name == "plan" else canvas.TRAIL
     pygame.draw.line(surface, colour, (x, y), (x + 16 * scale, y), scale + scale // 2)
     if name == "plan":
         for k in range(3):

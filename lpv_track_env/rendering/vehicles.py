@@ -1,54 +1,78 @@
-"""Vehicles from above: the one that drives, with wheels and tyre forces, and others around it."""
+"""Vehicles from above: the driven one, with wheels and tyre forces, and the others around it."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import pygame
 from numpy.typing import ArrayLike, NDArray
 
-from lpv_track_env import kernels
+from lpv_track_env import bicycle, kernels
 from lpv_track_env.bicycle import PSI, X, Y
-from lpv_track_env.rendering.forces import AxleForces
-from lpv_track_env.rendering.style import (
-    BODY,
-    FORCE,
-    GLASS,
-    INK,
-    LAMP,
-    OTHER,
-    OTHER_GLASS,
-    OUTLINE,
-    SHADOW,
-    SUPERSAMPLING,
-    TYRE,
-)
-from lpv_track_env.rendering.view import View, polyline, turned
+from lpv_track_env.rendering import canvas
+from lpv_track_env.rendering.canvas import SUPERSAMPLING, View
 from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]
 
 WHEEL = (0.72, 0.27)
-"""m, length and width of a wheel."""
+"""Length and width of a wheel, m."""
 CORNERS = 5
 """Points of a rounded corner."""
 FORCE_LENGTH = 1.8
-"""m of an arrow for each m/s^2 that an axle's force gives the vehicle."""
+"""Length of an arrow, m per m/s^2 that the axle's force accelerates the vehicle."""
 LEAST_FORCE = 0.15
-"""m/s^2 below which no arrow is drawn: it would be all tip."""
+"""m/s^2 below which no arrow is drawn: it would be all head."""
 LONGEST_FORCE = 9.0
-"""m of an arrow at most."""
+"""Largest length of an arrow, m."""
 
 OTHER_SHAPE = np.array(
     [(-0.5, -0.5), (0.42, -0.5), (0.5, -0.32), (0.5, 0.32), (0.42, 0.5), (-0.5, 0.5)]
 )
-"""Body (6, 2) as shares of length and width, from the middle, x forwards."""
+"""Outline of the body (6, 2) in shares of length and width, from its middle, x forwards."""
 OTHER_WINDSCREEN = np.array([(0.32, -0.36), (0.32, 0.36), (0.18, 0.44), (0.18, -0.44)])
+"""Windscreen (4, 2), in the same shares."""
+
+
+class AxleForces(NamedTuple):
+    """Lateral forces of the axles, N, and their slip angles, rad; positive to the left."""
+
+    front: float
+    rear: float
+    front_slip: float
+    rear_slip: float
+
+
+def axle_forces(
+    vx: float, vy: float, yaw_rate: float, steering_angle: float, car: VehicleParameters
+) -> AxleForces:
+    """Compute the axle forces of linear tyres, taken from `bicycle.field`.
+
+    They follow from the nominal parameters; another plant, or conditions that change the vehicle,
+    have other forces.
+    """
+    caf, rear_stiffness = car.front_cornering_stiffness, car.rear_cornering_stiffness
+    cosine = math.cos(steering_angle)
+
+    def sideward(front_stiffness: float, other: float) -> float:
+        """Force m (vy' + r vx), N, of the axle whose stiffness is not 0."""
+        parameters = car.as_array()
+        parameters[4], parameters[5] = front_stiffness, other
+        rates = bicycle.field(
+            vx, vy, yaw_rate, 1.0, 0.0, 0.0, steering_angle, cosine, math.sin(steering_angle),
+            float(bicycle.inverse_speed(vx)), *parameters.tolist(),
+        )  # fmt: skip
+        return car.mass * float(rates[1] + yaw_rate * vx)
+
+    # The front force is normal to the wheels; the field has its component across the body.
+    front, rear = sideward(caf, 0.0) / cosine, sideward(0.0, rear_stiffness)
+    return AxleForces(front, rear, front / caf, rear / rear_stiffness)
 
 
 def ackermann(steering_angle: float, wheelbase: float, track: float) -> tuple[float, float]:
-    """Angles (rad) of the left and right front wheel for that of the bicycle's one.
+    """Angles (rad) of the left and right front wheel for the bicycle's steering angle.
 
-    All axes then meet in one point on the rear axle's line.
+    The axes of all wheels then meet in one point, on the line of the rear axle.
     """
     sine, cosine = math.sin(steering_angle), math.cos(steering_angle)
     return (
@@ -58,7 +82,7 @@ def ackermann(steering_angle: float, wheelbase: float, track: float) -> tuple[fl
 
 
 class VehicleDrawing:
-    """A vehicle's shapes, in its own frame: x forwards, y left, from the centre of gravity."""
+    """Shapes of the driven vehicle about its centre of gravity, x forwards, y to the left."""
 
     def __init__(self, car: VehicleParameters) -> None:
         self._car = car
@@ -73,34 +97,33 @@ class VehicleDrawing:
         at = np.array([half - 0.03, 0.38 * side])
         self._lamps = (lamp + at + centre, (lamp + at) * (1.0, -1.0) + centre)
         self._half_track = side - 0.55 * WHEEL[1]
-        self._reach = math.hypot(half, side) + abs(middle)
 
     def draw(self, surface: pygame.Surface, view: View, record: Array) -> None:
-        """Draw the vehicle as an episode's record has it, its front wheels steered."""
+        """Draw the vehicle at the pose in an episode's record, its front wheels steered."""
         car, psi = self._car, float(record[PSI])
         place = np.array([record[X], record[Y]])
 
         def fill(colour: tuple[int, int, int], points: Array) -> None:
-            corners = view.pixels(turned(points, psi) + place).tolist()
+            corners = view.pixels(canvas.turned(points, psi) + place).tolist()
             pygame.draw.polygon(surface, colour, corners)
 
-        shade = view.pixels(turned(self._body, psi) + place + np.array([0.18, -0.22]))
-        pygame.draw.polygon(surface, SHADOW, shade.tolist())
-        fill(BODY, self._body)
+        shade = view.pixels(canvas.turned(self._body, psi) + place + np.array([0.18, -0.22]))
+        pygame.draw.polygon(surface, canvas.SHADOW, shade.tolist())
+        fill(canvas.BODY, self._body)
         for lamp in self._lamps:
-            fill(LAMP, lamp)
+            fill(canvas.LAMP, lamp)
         for glass in self._glass:
-            fill(GLASS, glass)
+            fill(canvas.GLASS, glass)
         angles = ackermann(float(record[kernels.STEERING]), car.wheelbase, 2.0 * self._half_track)
         for axle, turns in (
             (car.front_axle_distance, angles),
             (-car.rear_axle_distance, (0.0, 0.0)),
         ):
             for side, angle in zip((self._half_track, -self._half_track), turns, strict=True):
-                fill(TYRE, turned(_rectangle(*WHEEL), angle) + np.array([axle, side]))
-        outline = view.pixels(turned(np.vstack([self._body, self._body[:1]]), psi) + place)
-        polyline(surface, OUTLINE, outline, 1.3 * SUPERSAMPLING)
-        pygame.draw.circle(surface, INK, view.pixels(place).tolist(), 2 * SUPERSAMPLING)
+                fill(canvas.TYRE, canvas.turned(_rectangle(*WHEEL), angle) + np.array([axle, side]))
+        outline = view.pixels(canvas.turned(np.vstack([self._body, self._body[:1]]), psi) + place)
+        canvas.polyline(surface, canvas.OUTLINE, outline, 1.3 * SUPERSAMPLING)
+        pygame.draw.circle(surface, canvas.INK, view.pixels(place).tolist(), 2 * SUPERSAMPLING)
 
     def draw_forces(
         self, surface: pygame.Surface, view: View, record: Array, forces: AxleForces
@@ -137,18 +160,18 @@ def arrow(surface: pygame.Surface, start: Array, end: Array) -> None:
         start + half * across, neck + half * across, neck + 0.5 * head * across, end,
         neck - 0.5 * head * across, neck - half * across, start - half * across,
     ]  # fmt: skip
-    pygame.draw.polygon(surface, FORCE, [point.tolist() for point in shape])
+    pygame.draw.polygon(surface, canvas.FORCE, [point.tolist() for point in shape])
 
 
 def draw_others(surface: pygame.Surface, view: View, others: ArrayLike) -> None:
     """Draw other vehicles, (m, 5) [X m, Y m, heading rad, length m, width m].
 
-    Those out of sight, or not finite, are left out.
+    Vehicles out of sight, and rows that are not finite, are left out.
 
     Raises
     ------
     ValueError
-        For another shape.
+        If the shape is not (m, 5).
     """
     rows = np.asarray(others, dtype=np.float64)
     if rows.size == 0:
@@ -157,25 +180,25 @@ def draw_others(surface: pygame.Surface, view: View, others: ArrayLike) -> None:
         raise ValueError(f"others must be (m, 5): X, Y, heading, length, width; got {rows.shape}")
     rows = rows[np.isfinite(rows).all(axis=1)]
     reach = np.hypot(rows[:, 3:4], rows[:, 4:5])
-    for k in view.sees(rows[:, :2] - reach, rows[:, :2] + reach):
+    for k in view.visible(rows[:, :2] - reach, rows[:, :2] + reach):
         x, y, heading, length, width = rows[k].tolist()
-        for shape, colour in ((OTHER_SHAPE, OTHER), (OTHER_WINDSCREEN, OTHER_GLASS)):
-            corners = turned(shape * (length, width), heading) + np.array([x, y])
+        for shape, colour in ((OTHER_SHAPE, canvas.OTHER), (OTHER_WINDSCREEN, canvas.OTHER_GLASS)):
+            corners = canvas.turned(shape * (length, width), heading) + np.array([x, y])
             pygame.draw.polygon(surface, colour, view.pixels(corners).tolist())
 
 
 def _rectangle(length: float, width: float) -> Array:
-    """Corners (4, 2) about the origin, length along x."""
+    """Corners (4, 2) of a rectangle about the origin, its length along x."""
     return np.array([(0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5)]) * (length, width)
 
 
 def _across(x: float, ahead: float, behind: float, length: float) -> Array:
-    """A window (4, 2) across the body: half widths at its two ends, `length` backwards from x."""
+    """Corners (4, 2) of a window across the body: half widths at x and at `length` behind x."""
     return np.array([(x, ahead), (x, -ahead), (x - length, -behind), (x - length, behind)])
 
 
 def _rounded(half: float, side: float, front: float, rear: float) -> Array:
-    """Outline of a rectangle with rounded corners, radii front and rear, m."""
+    """Outline of a rectangle with rounded corners of radii `front` and `rear`, m."""
     points = []
     for sx, sy, start in ((1, 1, 0), (-1, 1, 1), (-1, -1, 2), (1, -1, 3)):
         radius = min(front if sx > 0 else rear, side)

@@ -1,4 +1,4 @@
-"""A window that shows frames in real time."""
+"""Window that shows frames in real time."""
 
 import os
 import warnings
@@ -6,26 +6,26 @@ import warnings
 import pygame
 
 UNSEEN_DRIVERS = ("offscreen", "dummy")
-"""SDL's video drivers without a window."""
+"""SDL's video drivers that have no window."""
 TITLE = "lpv-track-env"
 SURROUND = (255, 255, 255)
 IDLE = 20
-"""Looks a second for an event while paused."""
+"""Checks for events per second while paused."""
 
 
 class Window:
-    """A window, opened by the first frame; it can be resized, frames keep their shape.
+    """Window that the first frame opens; it can be resized, and frames keep their shape.
 
-    Space holds the time until it is pressed again; Escape, or closing the window, ends the drawing
-    for good. Without a display SDL draws unseen: that is warned of once, and nothing waits for real
+    Space pauses until it is pressed again; Escape, or closing the window, ends the drawing for
+    good. Without a display SDL draws invisibly: the window warns once and does not wait for real
     time.
 
     Parameters
     ----------
     fps
-        Frames a second that are shown at most.
+        Largest number of frames per second.
     otherwise
-        What to do where there is no display, for the messages.
+        Advice for users without a display, for the messages.
     """
 
     def __init__(self, fps: int, otherwise: str = "use render_mode='rgb_array'") -> None:
@@ -40,31 +40,31 @@ class Window:
         Raises
         ------
         RuntimeError
-            In one line, where SDL has no video driver at all.
+            If SDL has no video driver at all.
         """
         if self.dismissed:
             return
         window = self._window or self._open(frame.get_size())
-        if not self._heed(frame):
+        if not self._handle_events(frame):
             return
         self._put(frame, pygame.display.get_surface() or window)
         if self._clock is not None:
             self._clock.tick(self._fps)
 
     def close(self) -> None:
-        """Close it, if open; a later frame opens it again unless it was dismissed."""
+        """Close the window; a later frame opens it again unless the user dismissed it."""
         if self._window is not None:
             pygame.display.quit()
         self._window = None
         self._clock = None
 
     def prepare(self) -> None:
-        """Find out whether there is anything to draw on.
+        """Check that SDL can draw.
 
         Raises
         ------
         RuntimeError
-            In one line, where SDL has no video driver at all.
+            If SDL has no video driver at all.
         """
         try:
             pygame.display.init()
@@ -91,8 +91,8 @@ class Window:
             )
         return self._window
 
-    def _heed(self, frame: pygame.Surface) -> bool:
-        """Take in what was pressed, and wait while paused; False once the window is dismissed."""
+    def _handle_events(self, frame: pygame.Surface) -> bool:
+        """Handle events, and wait while paused; return False once the window is dismissed."""
         paused = False
         while True:
             for event in pygame.event.get():
@@ -113,7 +113,7 @@ class Window:
 
     @staticmethod
     def _put(frame: pygame.Surface, window: pygame.Surface) -> None:
-        """Lay a frame on the middle of the window, as large as fits."""
+        """Draw a frame in the middle of the window, as large as fits."""
         have, need = window.get_size(), frame.get_size()
         if have == need:
             window.blit(frame, (0, 0))
@@ -126,13 +126,13 @@ class Window:
 
 
 def _within(size: tuple[int, int], room: tuple[int, int]) -> tuple[int, int]:
-    """A size as large as fits into a room, its shape kept."""
+    """Scale a size to fit into a room, its shape kept."""
     share = min(room[0] / size[0], room[1] / size[1])
     return max(round(size[0] * share), 1), max(round(size[1] * share), 1)
 
 
 def _fitting(size: tuple[int, int]) -> tuple[int, int]:
-    """A window's size for frames: theirs, or less where the desktop has not the room."""
+    """Size of a window for frames: theirs, or smaller if the desktop is smaller."""
     desktops = pygame.display.get_desktop_sizes()
     room = desktops[0] if desktops else size
     return size if size[0] <= room[0] and size[1] <= room[1] else _within(size, room)

@@ -15,13 +15,11 @@ from numpy.typing import NDArray
 
 from lpv_track_env import PATH_TRACKING, kernels
 from lpv_track_env.env import PathTrackingEnv
-from lpv_track_env.rendering import COLOURINGS, HEIGHT, WIDTH, Renderer, Scenery, style
-from lpv_track_env.rendering.camera import MIDDLE, ROOM, Camera
+from lpv_track_env.rendering import COLOURINGS, HEIGHT, WIDTH, Renderer, Scenery, canvas
+from lpv_track_env.rendering.canvas import SCENE_HEIGHT, View, clipped
 from lpv_track_env.rendering.charts import signals_of
-from lpv_track_env.rendering.forces import axle_forces
-from lpv_track_env.rendering.style import SCENE_HEIGHT
-from lpv_track_env.rendering.vehicles import ackermann
-from lpv_track_env.rendering.view import View, clipped
+from lpv_track_env.rendering.renderer import MIDDLE, ROOM, Camera
+from lpv_track_env.rendering.vehicles import ackermann, axle_forces
 from lpv_track_env.vehicle import VEHICLES
 
 Frame = NDArray[np.uint8]
@@ -84,8 +82,8 @@ def test_a_frame_is_a_picture(trajectory: str, vehicle: str) -> None:
     # A light scene with something in it.
     assert 200.0 < frame.mean() < 250.0
     assert len(np.unique(frame.astype(np.uint32) @ np.uint32([65536, 256, 1]))) > 50
-    assert count(scene(frame), style.BODY) > 300
-    assert count(charts(frame), style.TRACE) > 0 or env._record[kernels.STEPS] == 0
+    assert count(scene(frame), canvas.BODY) > 300
+    assert count(charts(frame), canvas.TRACE) > 0 or env._record[kernels.STEPS] == 0
 
 
 def test_frames_change_over_time() -> None:
@@ -127,8 +125,8 @@ def test_trail_and_vehicle_stay_in_the_picture() -> None:
         env.step(np.array([0.8, 0.0], dtype=np.float32))
         if k % 40 == 39:
             frame = scene(frame_of(env))
-            trails.append(np.ptp(places(frame, style.TRAIL)[:, 0]))
-            body = places(frame, style.BODY)
+            trails.append(np.ptp(places(frame, canvas.TRAIL)[:, 0]))
+            body = places(frame, canvas.BODY)
             assert np.abs(body.mean(axis=0) - MIDDLE)[0] < ROOM[0] + 10.0
             assert np.abs(body.mean(axis=0) - MIDDLE)[1] < 5.0
     assert trails[0] < trails[1]
@@ -145,7 +143,7 @@ def test_camera_moves_smoothly_and_looks_ahead() -> None:
         x, y = (float(np.interp(s, env.path.arc_length, axis)) for axis in (env.path.x, env.path.y))
         camera.follow(0.05 * k, 7.0, x, y, s, env.path)
         view = camera.view(x, y)
-        vehicle = view.pixels(np.array([x, y])) / style.SUPERSAMPLING
+        vehicle = view.pixels(np.array([x, y])) / canvas.SUPERSAMPLING
         offset = (vehicle - MIDDLE) / ROOM
         assert np.hypot(*offset) <= 1.0 + 1e-9
         if before is not None:
@@ -177,15 +175,15 @@ def test_steered_wheels_and_forces_are_drawn() -> None:
     steered = renderer.draw(record)
     assert straight is not None
     assert steered is not None
-    assert count(scene(straight), style.FORCE) == count(scene(steered), style.FORCE) - (
-        count(scene(steered)[: SCENE_HEIGHT - 60], style.FORCE)
+    assert count(scene(straight), canvas.FORCE) == count(scene(steered), canvas.FORCE) - (
+        count(scene(steered)[: SCENE_HEIGHT - 60], canvas.FORCE)
     )
     # To the left of a path that leads east, at the front axle.
-    arrow = places(scene(steered)[: SCENE_HEIGHT - 60], style.FORCE)
-    body = places(scene(steered), style.BODY).mean(axis=0)
+    arrow = places(scene(steered)[: SCENE_HEIGHT - 60], canvas.FORCE)
+    body = places(scene(steered), canvas.BODY).mean(axis=0)
     assert arrow[:, 0].max() > body[0] + 15.0
     assert arrow[:, 1].min() < body[1] - 20.0
-    tyres = [count(scene(frame)[100:350, 300:700], style.TYRE) for frame in (straight, steered)]
+    tyres = [count(scene(frame)[100:350, 300:700], canvas.TYRE) for frame in (straight, steered)]
     assert tyres[0] != tyres[1]
 
 
@@ -237,7 +235,7 @@ def test_path_is_coloured_by_speed_or_curvature() -> None:
         env.reset(seed=0)
         pictures[colour] = frame_of(env)
     assert (pictures["speed"] != pictures["curvature"]).any()
-    shades = {colour: style.shades(colour, [0.0])[0] for colour in COLOURINGS}
+    shades = {colour: canvas.shades(colour, [0.0])[0] for colour in COLOURINGS}
     # A path begins straight and slow: the least of both, on the map.
     for colour, frame in pictures.items():
         assert count(frame, shades[colour]) > 5
@@ -290,10 +288,10 @@ def test_plan_is_drawn_until_it_is_taken_away() -> None:
     plan = np.column_stack([np.linspace(5.0, 20.0, 20), np.linspace(0.0, 3.0, 20)])
     env.show_agent(plan)  # before the first frame: it must not be lost
     with_plan = frame_of(env)
-    assert count(scene(with_plan), style.PLAN) > 100
+    assert count(scene(with_plan), canvas.PLAN) > 100
     env.show_agent()
     without = frame_of(env)
-    assert not count(without, style.PLAN)
+    assert not count(without, canvas.PLAN)
     for odd in (np.empty((0, 2)), np.full((3, 2), np.nan), np.full((2, 2), 1e12)):
         env.show_agent(odd)
         # But for the key, which says what a plan looks like.
@@ -309,7 +307,7 @@ def test_end_is_written() -> None:
     env = make(trajectory="straight")
     env.reset(seed=0, options={"lateral_error": 6.0})
     env.step(ACTION)
-    assert count(scene(frame_of(env)), style.ALERT) > 20
+    assert count(scene(frame_of(env)), canvas.ALERT) > 20
 
 
 def test_close_twice_and_draw_again() -> None:
@@ -483,11 +481,11 @@ def drawn(scenery: Scenery | None = None, others: NDArray[np.float64] | None = N
 
 def test_scenery_takes_the_corridors_place() -> None:
     bare, road = drawn(Scenery([], [])), drawn(Scenery([SQUARE], []))
-    assert count(bare, style.ROAD) == 0
-    wide = count(road, style.ROAD)
+    assert count(bare, canvas.ROAD) == 0
+    wide = count(road, canvas.ROAD)
     assert wide > 1000
     line = np.array([(-8.0, 10.0), (8.0, 10.0)])
-    solid, dashed = (count(drawn(Scenery([SQUARE], [(line, d)])), style.ROAD) for d in (0, 1))
+    solid, dashed = (count(drawn(Scenery([SQUARE], [(line, d)])), canvas.ROAD) for d in (0, 1))
     assert solid < dashed < wide
 
 
@@ -511,13 +509,13 @@ def test_scenery_that_cannot_be_drawn_is_one_line() -> None:
 def test_other_vehicles_are_drawn_while_set() -> None:
     alone = drawn()
     near = np.array([[6.0, 4.0, 0.3, 4.6, 1.9]])
-    assert count(drawn(others=near), style.OTHER) > 300
+    assert count(drawn(others=near), canvas.OTHER) > 300
     far, broken = near + 1000.0, near * np.nan
     for unseen in (far, broken, np.empty((0, 5))):
         np.testing.assert_array_equal(drawn(others=unseen), alone)
     # Turned by a quarter it is as large, elsewhere.
     turned = drawn(others=np.array([[6.0, 4.0, 0.3 + np.pi / 2, 4.6, 1.9]]))
-    assert abs(count(turned, style.OTHER) - count(drawn(others=near), style.OTHER)) < 200
+    assert abs(count(turned, canvas.OTHER) - count(drawn(others=near), canvas.OTHER)) < 200
     with pytest.raises(ValueError, match=r"others must be \(m, 5\)"):
         drawn(others=np.zeros((2, 4)))
 
