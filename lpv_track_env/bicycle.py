@@ -153,7 +153,7 @@ def jacobian(
 
 
 def inverse_speed(vx: Any) -> Any:
-    """Compute q(vx), s/m, on floats or NumPy arrays: 1/|vx| from LOW_SPEED upwards, finite below."""
+    """Compute q(vx), s/m, on floats or arrays: 1/|vx| from LOW_SPEED upwards, finite below."""
     speed = np.abs(vx)
     return inverse_speed_polynomial(
         np.minimum(speed / LOW_SPEED, 1.0), np.maximum(speed, LOW_SPEED)

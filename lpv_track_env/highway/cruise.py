@@ -1,14 +1,15 @@
-"""Adaptive cruise control: the reference's speed, lowered to keep a gap to who drives ahead.
+"""Adaptive cruise control: lower the speed of the reference to keep a gap to the vehicle ahead.
 
-The Intelligent Driver Model (Treiber, Hennecke, Helbing: Congested traffic states in empirical
-observations and microscopic simulations, Phys. Rev. E 62, 2000) without its free-road term, for
-that is the path's own speed profile. With speed v, gap g between bumpers and approach rate dv::
+The law is the Intelligent Driver Model (Treiber, Hennecke, Helbing: Congested traffic states in
+empirical observations and microscopic simulations, Phys. Rev. E 62, 2000) without its free-road
+term, which the path's own speed profile replaces. With speed v, gap g between bumpers and approach
+rate dv::
 
     dv/dt = a (1 - (g* / g)^2),    g* = s0 + v T + v dv / (2 sqrt(a b))
 
-It is integrated forward from the vehicle's own speed, with vehicles ahead keeping theirs, over
-all that an agent's preview shows. So a controller that looks ahead sees the braking before it is
-due.
+It is integrated forward from the vehicle's present speed over the whole preview of an agent, while
+the vehicles ahead keep their speeds. So a predictive controller sees in the preview that it will
+have to brake.
 """
 
 import math
@@ -25,15 +26,15 @@ from trajectories.table import SPEED, TIME
 Array = NDArray[np.float64]
 
 STANDSTILL = 1e-3
-"""m/s that stand for a stop: a reference's time would not go on at 0."""
+"""Speed of a stopped reference, m/s: at 0 its time would not advance."""
 CRAWL = 0.3
-"""m/s; slower than this a stop is asked for at once, for a path's cells do not resolve it."""
+"""m/s: a profile that stops from a lower speed stops at once; a path's cells cannot resolve it."""
 HELD = 100.0
-"""m beyond a profile's end over which its last speed holds."""
+"""m beyond a profile's end for which its last speed is held."""
 
 
 class Leader(NamedTuple):
-    """A vehicle ahead: gap between the bumpers along the path, m, and its speed along it, m/s."""
+    """A vehicle ahead: gap between the bumpers, m, and its speed, m/s, both along the path."""
 
     gap: float
     speed: float
@@ -41,29 +42,30 @@ class Leader(NamedTuple):
 
 @dataclass(frozen=True)
 class CruiseControl:
-    """Settings of the gap that is kept.
+    """Settings of the gap to the vehicle ahead.
 
     Parameters
     ----------
     time_gap
-        T, s: the gap grows with speed by it.
+        T, s: growth of the gap with speed.
     standstill_gap
         s0, m, between the bumpers.
     acceleration, deceleration
-        a and b, m/s^2, comfortable.
+        Comfortable acceleration a and deceleration b, m/s^2.
     max_deceleration
-        m/s^2, of the reference where it brakes hard.
+        Largest deceleration of the reference, m/s^2.
     range
-        m ahead on the path that are watched.
+        Length of the path ahead that is searched for vehicles, m.
     side_clearance
-        m between two bodies side by side under which the other is in the way.
+        Least distance between two bodies side by side, m; a closer one blocks the path.
     cut_in_time
-        s: who will be in the way within it, keeping its lateral speed, is so already.
+        s: a vehicle that will block the path within this time, at its present lateral speed, blocks
+        it already.
 
     Raises
     ------
     ValueError
-        For a setting that is not a positive finite number.
+        If a setting is not a positive finite number.
     """
 
     time_gap: float = 1.5
@@ -82,39 +84,39 @@ class CruiseControl:
                 raise ValueError(f"cruise control: {field.name} must be positive, not {value!r}")
 
     def response(self, speed: float, leader: Leader) -> float:
-        """dv/dt, m/s^2, that a leader asks for; never above `acceleration`."""
+        """Compute dv/dt, m/s^2, behind a leader; at most `acceleration`."""
         approach = speed - leader.speed
         root = 2.0 * math.sqrt(self.acceleration * self.deceleration)
         wanted = self.standstill_gap + max(speed * self.time_gap + speed * approach / root, 0.0)
-        asked = self.acceleration * (1.0 - (wanted / max(leader.gap, 0.1)) ** 2)
-        return max(asked, -self.max_deceleration)
+        acceleration = self.acceleration * (1.0 - (wanted / max(leader.gap, 0.1)) ** 2)
+        return max(acceleration, -self.max_deceleration)
 
     def profile(
         self, arc_length: float, speed: float, leaders: Sequence[Leader], period: float, steps: int
     ) -> tuple[Array, Array]:
-        """Arc lengths (steps + 1,), m, and speeds (steps + 1,), m/s, of keeping the gaps.
+        """Compute the profile that keeps the gaps: arc lengths and speeds, each (steps + 1,).
 
         Parameters
         ----------
         arc_length, speed
-            Where and how fast it begins, m and m/s.
+            Arc length and speed at the start, m and m/s.
         leaders
-            One or more; the one that asks for most counts.
+            One or more vehicles ahead; the one that requires the lowest acceleration counts.
         period
-            s between steps.
+            Time between steps, s.
         steps
-            Their number.
+            Number of steps.
         """
         s, v = arc_length, max(speed, 0.0)
         ahead = [s + leader.gap for leader in leaders]
         places, speeds = [s], [v]
         for k in range(steps):
             t = k * period
-            asked = min(
+            acceleration = min(
                 self.response(v, Leader(place + leader.speed * t - s, leader.speed))
                 for place, leader in zip(ahead, leaders, strict=True)
             )
-            after = max(v + period * asked, 0.0)
+            after = max(v + period * acceleration, 0.0)
             s += 0.5 * period * (v + after)
             v = after
             places.append(s)
@@ -125,24 +127,23 @@ class CruiseControl:
 
 
 def lower_speed(path: ReferencePath, table: Array, arc_length: Array, speed: Array) -> None:
-    """Write the path's speeds to `table`, but at most `speed` from where it begins, and the times.
+    """Write the path's speeds, lowered to a profile where that is lower, and the times to a table.
 
-    Beyond the profile's end its last speed holds: a reference that stops there does not start
-    again.
+    Beyond the profile's end its last speed is held: a reference that stops does not start again.
 
     Parameters
     ----------
     path
-        Whose `table` is the base, (n, 8).
+        Path with the original speeds.
     table
-        (n, 8), written to: its columns SPEED and TIME.
+        (n, 8): its columns SPEED and TIME are written.
     arc_length, speed
-        (m,) m, not decreasing, of a closed path beyond its length where the profile passes the
-        seam; (m,) m/s.
+        Profile, (m,) m and (m,) m/s. Arc length does not decrease, and counts on beyond the length
+        of a closed path.
     """
     table[:, SPEED] = path.speed
     n, h = len(path.speed), path.spacing
-    # The cell in which it begins has both its nodes lowered.
+    # Lower both nodes of the cell in which the profile begins.
     first = math.floor(arc_length[0] / h) - 1
     last = math.floor((arc_length[-1] + HELD) / h)
     if path.closed:

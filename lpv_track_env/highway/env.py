@@ -16,9 +16,7 @@ from lpv_track_env.conditions import Conditions
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.highway import scenes
 from lpv_track_env.highway.cruise import CruiseControl
-from lpv_track_env.highway.ego import EgoVehicle
-from lpv_track_env.highway.reference import TrafficReference
-from lpv_track_env.highway.traffic import others_on
+from lpv_track_env.highway.traffic import EgoVehicle, TrafficReference, others_on
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task
 from lpv_track_env.validation import check_action
@@ -31,7 +29,7 @@ SURROUNDINGS: dict[str, dict[str, Any]] = {
     "lidar": {"type": "LidarObservation"},
     "kinematics": {"type": "Kinematics", "see_behind": True},
 }
-"""highway-env's configurations of the observations that have a name here."""
+"""Configurations of highway-env's observations, by their names here."""
 
 OPTIONS = tuple(option for option in RESET_OPTIONS if option != "trajectory")
 EXTRA_TIME = 30.0
@@ -158,7 +156,7 @@ class HighwayTrackEnv(PathTrackingEnv):
         self.observation_space = self._space(self.observation_space)
 
     def _space(self, tracking: spaces.Space[Any]) -> spaces.Space[Any]:
-        """The whole observation's space, from that of its tracking part."""
+        """Return the space of the whole observation, from the space of its tracking part."""
         if not self._surrounded:
             return tracking
         around = self.highway.observation_type.space()
@@ -167,7 +165,7 @@ class HighwayTrackEnv(PathTrackingEnv):
         return spaces.flatten_space(spaces.Tuple((tracking, around)))
 
     def _observation_of(self, tracking: NDArray[np.float32]) -> Any:
-        """The whole observation around its tracking part."""
+        """Return the whole observation, from its tracking part."""
         if not self._surrounded:
             return tracking
         around = self.highway.observation_type.observe().astype(np.float32)
@@ -176,7 +174,7 @@ class HighwayTrackEnv(PathTrackingEnv):
         return {"tracking": tracking, "surroundings": around}
 
     def episode_task(self, options: Mapping[str, Any]) -> Task:
-        """Task of an episode with reset options `trajectory` and `vehicle`, if given."""
+        """Make the task of an episode from the reset options `trajectory` and `vehicle`."""
         task = super().episode_task(options)
         limit = task.time_limit
         if limit is None:
@@ -191,7 +189,7 @@ class HighwayTrackEnv(PathTrackingEnv):
         for key in options:
             choose("reset option", key, OPTIONS)
         drawn = int(self.np_random.integers(2**31)) if seed is None else seed
-        # What is still refused below leaves no episode: its road is gone.
+        # An error below leaves no running episode, because its road is gone.
         self._running = False
         start = scenes.populate(self.highway, drawn)
         path = scenes.path_of(self.scene, int(start.lane_index[2]), self.speed_limits)
@@ -201,11 +199,11 @@ class HighwayTrackEnv(PathTrackingEnv):
         self._reference = TrafficReference(path, self.vehicle, self.layout, self.cruise)
         self._take_table(self._reference.table)
         self._put_ego(start)
-        self._look_ahead()
+        self._follow_traffic()
         return self._observation_of(tracking), {**info, **self._info()}
 
     def _put_ego(self, start: Any) -> None:
-        """Put the plant's vehicle on the road, in place of highway-env's own."""
+        """Replace highway-env's ego vehicle on the road by the plant's."""
         road = self.highway.road
         self._ego = EgoVehicle(road, self.vehicle)
         road.vehicles[road.vehicles.index(start)] = self._ego
@@ -215,18 +213,14 @@ class HighwayTrackEnv(PathTrackingEnv):
         self._draw_others()
 
     def _begin_drawing(self) -> None:
-        """Tell the renderer, if there is one, of a new episode: its road and traffic."""
+        """Give the renderer, if there is one, the road and traffic of a new episode."""
         if self._renderer is not None:
-            from lpv_track_env.highway.drawing import scenery
-
-            self._renderer.begin(self.task, scenery(self.highway.road.network))
+            self._renderer.begin(self.task, scenes.scenery(self.highway.road.network))
             self._draw_others()
 
     def _draw_others(self) -> None:
         if self._renderer is not None:
-            from lpv_track_env.highway.drawing import boxes
-
-            self._renderer.others = boxes(self.others)
+            self._renderer.others = scenes.bodies(self.others)
 
     def _place(self) -> None:
         assert self._ego is not None
@@ -234,18 +228,18 @@ class HighwayTrackEnv(PathTrackingEnv):
 
     @property
     def others(self) -> list[Any]:
-        """Every other body on the road: highway-env's vehicles and objects."""
+        """All other vehicles and objects on the road."""
         return others_on(self.highway.road, self._ego)
 
-    def _look_ahead(self) -> None:
-        """Find who is ahead, and lower the reference's speed to keep the gap."""
+    def _follow_traffic(self) -> None:
+        """Find the vehicle ahead, and lower the reference's speed to keep the gap."""
         s, speed = float(self._record[kernels.ARC_LENGTH]), float(self._record[VX])
-        self._reference.look(s, speed, self.others)
+        self._reference.update(s, speed, self.others)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Drive one control period; see the class for actions, rewards, ends and errors."""
         if self._running:
-            # What the plant would refuse must not move the traffic.
+            # An action that the plant would refuse must not move the traffic.
             check_action(action)
             scenes.move(self.highway.road, self.control_period)
             self._draw_others()
@@ -261,7 +255,7 @@ class HighwayTrackEnv(PathTrackingEnv):
             info["end"] = kernels.END_NAMES[kernels.COLLISION]
             self._record[kernels.END] = kernels.COLLISION
             terminated, truncated, self._running = True, False, False
-        self._look_ahead()
+        self._follow_traffic()
         return self._observation_of(tracking), reward, terminated, truncated, info | self._info()
 
     def _info(self) -> dict[str, Any]:
@@ -275,13 +269,13 @@ class HighwayTrackEnv(PathTrackingEnv):
 
 
 def stoppable(vehicle: str | Path | VehicleParameters) -> VehicleParameters:
-    """Vehicle whose controllers may come to a halt: behind others, a least speed is a collision."""
+    """Return a vehicle with lowest speed 0: behind others, a least speed means a collision."""
     car = load_vehicle(vehicle)
     return car.replace(speed_range=(0.0, car.speed_range[1]))
 
 
 def _observation_config(surroundings: str | Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """highway-env's configuration of an observation; None for none."""
+    """Return highway-env's configuration of the observation; None for no observation."""
     if surroundings is None:
         return None
     if isinstance(surroundings, str):

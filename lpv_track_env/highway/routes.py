@@ -1,11 +1,12 @@
 """Reference paths from routes over highway-env's lanes.
 
-Lanes that follow each other do not join: on `racetrack` they overlap by up to 2.6 m or leave as
-much open, and the heading jumps by up to 5 degrees there. So their centre lines are sampled, cut
-back at every junction, and refitted as one smooth curve, periodic where the route is a lap.
+Consecutive lanes do not join exactly: on `racetrack` they overlap or leave a gap of up to 2.6 m,
+and the heading jumps by up to 5 degrees. So their centre lines are sampled, shortened at every
+junction, and fitted by one smooth curve, which is periodic if the route is a lap.
 
-highway-env's y axis is drawn downwards, but its angles go from x to y like ours: its coordinates
-are taken as they are, and what is left of the path here is drawn right of it there.
+highway-env draws its y axis downwards, but its angles turn from x to y as they do here. So its
+coordinates are used unchanged; the left of a path is drawn on its right in highway-env's own
+pictures.
 """
 
 from collections.abc import Sequence
@@ -26,21 +27,20 @@ Array = NDArray[np.float64]
 LaneIndex = tuple[str, str, int]
 
 SPACING = 1.0
-"""m between samples of a centre line."""
+"""Distance between samples of a centre line, m."""
 CUT = 2.0
-"""m of each lane that are left out at a junction, beyond what overlaps."""
+"""Length of each lane left out at a junction, in addition to half the overlap, m."""
 SMOOTHING = 0.05
-"""m, rms by which the path may pass the sampled centre lines."""
+"""Largest rms deviation of the path from the sampled centre lines, m."""
 
 
 def lane_route(network: RoadNetwork, nodes: Sequence[str], lane: int) -> list[LaneIndex]:
-    """Lanes along a route of nodes: `lane` of the first road, then whichever begins nearest.
+    """Find the lanes along a route: `lane` of the first road, then the lanes that begin nearest.
 
     Raises
     ------
     ValueError
-        If two nodes that follow each other are not joined by a road, or the first road has no such
-        lane.
+        If two consecutive nodes are not joined by a road, or the first road has no such lane.
     """
     if len(nodes) < 2:
         raise ValueError("a route needs two nodes or more")
@@ -63,12 +63,12 @@ def lane_route(network: RoadNetwork, nodes: Sequence[str], lane: int) -> list[La
 
 
 def road_ahead(network: RoadNetwork, begin: str, end: str) -> tuple[str, ...]:
-    """Nodes of the road that goes on from a first one, until it ends or closes to a lap.
+    """Follow the road from `begin` by `end` until it ends or closes a lap, and return its nodes.
 
     Raises
     ------
     ValueError
-        Where it branches: then a route must be given.
+        If the road branches, so that a route must be given.
     """
     nodes = [begin, end]
     while nodes[-1] != begin:
@@ -89,7 +89,7 @@ def road_ahead(network: RoadNetwork, begin: str, end: str) -> tuple[str, ...]:
 
 
 def centre_points(network: RoadNetwork, route: Sequence[LaneIndex], *, closed: bool) -> Array:
-    """Points (n, 2), m, along the centre lines of a route's lanes, thinned at junctions."""
+    """Sample the centre lines of a route's lanes, (n, 2), m, with gaps at junctions."""
     lanes = [network.get_lane(index) for index in route]
     count = len(lanes)
     parts = []
@@ -97,7 +97,7 @@ def centre_points(network: RoadNetwork, route: Sequence[LaneIndex], *, closed: b
         inner_start, inner_end = closed or k > 0, closed or k < count - 1
         start = _cut(lanes[k - 1], lane) if inner_start else 0.0
         end = _cut(lane, lanes[(k + 1) % count]) if inner_end else 0.0
-        # Of a short lane something stays.
+        # Keep at least a fifth of a short lane.
         share = min(1.0, 0.8 * lane.length / max(start + end, 1e-9))
         start, end = share * start, lane.length - share * end
         steps = max(int(np.ceil((end - start) / SPACING)), 1)
@@ -107,7 +107,7 @@ def centre_points(network: RoadNetwork, route: Sequence[LaneIndex], *, closed: b
 
 
 def _cut(before: AbstractLane, after: AbstractLane) -> float:
-    """How much of either lane is left out at their junction, m: half the overlap, and `CUT`."""
+    """Length left out of either lane at their junction, m: half the overlap, and `CUT`."""
     end = np.asarray(before.position(before.length, 0.0))
     heading = before.heading_at(before.length)
     gap = np.asarray(after.position(0.0, 0.0)) - end
@@ -128,20 +128,20 @@ def reference_path(
     Parameters
     ----------
     network
-        The lanes.
+        Road network with the lanes.
     route
-        Lanes that follow each other; of a lap, the last leads to the first.
+        Consecutive lanes; the last lane of a lap leads to the first.
     limits
-        Of the speed; its `max_speed` is lowered to the least speed limit of the route's lanes.
+        Speed limits; `max_speed` is lowered to the lowest speed limit of the route's lanes.
     closed
         Whether the route is a lap.
     name
-        Of the path.
+        Name of the path.
 
     Returns
     -------
     ReferencePath
-        With `route`, and how far it passes the lanes' centres, in its metadata.
+        A path with `route` and its deviation from the lanes' centres in its metadata.
     """
     points = centre_points(network, route, closed=closed)
     lanes = [network.get_lane(index) for index in route]
@@ -154,7 +154,7 @@ def reference_path(
 def _fitted(
     points: bytes, limits: SpeedLimits, closed: bool, name: str, route: tuple[LaneIndex, ...]
 ) -> ReferencePath:
-    """Fit points, once in a process: roads are made anew for every episode, mostly the same."""
+    """Fit a path once per process: each episode makes its road anew, but mostly the same one."""
     smoothed = smooth(np.frombuffer(points).reshape(-1, 2), SMOOTHING, closed=closed)
     return from_geometry(
         smoothed.geometry, limits, name, closed=closed,

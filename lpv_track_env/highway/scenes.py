@@ -10,9 +10,9 @@ roundabout            roundabout-v1              in from the south, out to the n
 roundabout-generic    roundabout-generic-v1      likewise, a smaller one
 ====================  =========================  ================================================
 
-Road, traffic and where the ego vehicle starts are made by highway-env itself; the environments are
-those in which vehicles see each other across the ends of their lanes (`-v1`: without it they run
-into each other there).
+highway-env itself makes the road, the traffic and the start of the ego vehicle. Its `-v1`
+environments are used, in which vehicles notice each other across the ends of lanes; in the others
+they collide there.
 """
 
 import math
@@ -25,42 +25,53 @@ from typing import Any
 import gymnasium
 import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.road.lane import AbstractLane, LineType
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
+from highway_env.vehicle.objects import RoadObject
+from numpy.typing import NDArray
 
 from lpv_track_env.highway import routes
+from lpv_track_env.rendering import Scenery
 from trajectories import ReferencePath
 from trajectories.naming import choose
 from trajectories.speed import SpeedLimits
 
 SIMULATION_PERIOD = 1.0 / 15.0
-"""s; highway-env's own: its vehicles are moved in steps that are not longer."""
+"""Longest step in which highway-env moves its vehicles, s."""
 CIRCUIT = ("a", "b", "c", "d", "e", "f", "g", "h", "i", "a")
 OVAL = ("a", "b", "c", "d", "e", "f", "g", "h", "a")
 THROUGH = ("ser", "ses", "se", "ex", "ee", "nx", "nxs", "nxr")
 
+SURFACE_LENGTH = 10.0
+"""Length of a lane that is drawn as one surface, m."""
+EDGE_SPACING = 1.0
+"""Distance between the drawn points of a lane's edges, m."""
+
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A road, its traffic, and the ego vehicle's route.
+    """A road, its traffic, and the route of the ego vehicle.
 
     Parameters
     ----------
     name
-        Of the paths made from it.
+        Name of the scene and of the paths made from it.
     road
-        Id of an environment of highway-env that makes road and traffic, or a road network, whose
-        traffic is then `IDMVehicle` on its lanes at random.
+        Id of a highway-env environment that makes road and traffic, or a road network, on whose
+        lanes `IDMVehicle`s are placed at random.
     route
-        Nodes of the network, in order; a lap ends with the node that it begins with.
+        Nodes of the network, in order; a lap ends with its first node.
     max_speed
-        m/s of the reference, where the lanes allow it.
+        Largest speed of the reference, m/s, where the lanes allow it.
     traffic
-        Key of the environment's configuration that says how many other vehicles there are; None:
-        their number is the environment's own.
+        Key for the number of other vehicles in the environment's configuration; None if the number
+        cannot be set.
     config
-        Configuration of the environment, beside its defaults.
+        Changes to the environment's default configuration.
     """
 
     name: str
@@ -72,24 +83,24 @@ class Scene:
 
     @property
     def closed(self) -> bool:
-        """Whether the route is a lap."""
+        """True if the route is a lap."""
         return self.route[0] == self.route[-1]
 
     def make(self, other_vehicles: int | None, observation: Mapping[str, Any]) -> AbstractEnv:
-        """Make the environment of highway-env, whose road and traffic are used.
+        """Make the highway-env environment that provides road and traffic.
 
         Parameters
         ----------
         other_vehicles
-            Their number, in the terms of the scene: racetracks draw up to as many and one more;
-            None leaves it to the environment.
+            Value of the scene's `traffic` key: racetracks draw up to one vehicle more than that.
+            None keeps the environment's own number.
         observation
-            highway-env's configuration of an observation.
+            Configuration of highway-env's observation.
 
         Raises
         ------
         ValueError
-            If the number cannot be set, or is negative.
+            If the number of vehicles cannot be set, or is negative.
         """
         config: dict[str, Any] = {**self.config, "observation": dict(observation)}
         if other_vehicles is not None:
@@ -119,12 +130,13 @@ SCENES: dict[str, Scene] = {
 
 
 def load(scene: "str | Scene | RoadNetwork", route: Sequence[str] | None = None) -> Scene:
-    """Resolve a scene's name, a scene, or a network with a route of nodes.
+    """Return the scene of a name, of a road network with a route, or a scene with another route.
 
     Raises
     ------
     ValueError
-        For an unknown name (with the known ones and the nearest), or a network without a route.
+        For an unknown name (the message lists the known ones and the nearest), or for a network
+        without a route.
     """
     if isinstance(scene, RoadNetwork):
         if route is None:
@@ -138,36 +150,36 @@ def load(scene: "str | Scene | RoadNetwork", route: Sequence[str] | None = None)
 
 
 def populate(highway: AbstractEnv, seed: int) -> Vehicle:
-    """Make the road and traffic of a seed, and return the ego vehicle as highway-env has it.
+    """Make the road and traffic of a seed, and return highway-env's ego vehicle.
 
-    One thing is not left as it is: IDM brakes on below standstill, and highway-env's vehicles then
-    drive off backwards; here they stop.
+    One thing is changed: IDM brakes on below standstill, so highway-env's vehicles would drive
+    backwards; here they stop.
     """
     highway.reset(seed=seed)
-    for one in highway.road.vehicles:
-        one.MIN_SPEED = 0.0
+    for vehicle in highway.road.vehicles:
+        vehicle.MIN_SPEED = 0.0
     return highway.vehicle
 
 
 def move(road: Road, period: float) -> None:
-    """Have every vehicle decide and drive for a control period (s), in steps as highway-env's."""
+    """Let every vehicle decide and drive for a control period (s), in steps as highway-env's."""
     steps = math.ceil(period / SIMULATION_PERIOD - 1e-9)
     for _ in range(steps):
         road.act()
-        for one in road.vehicles:
-            one.step(period / steps)
+        for vehicle in road.vehicles:
+            vehicle.step(period / steps)
 
 
 def collide(road: Road, period: float) -> None:
-    """Have highway-env look for collisions: who touches another is `crashed` from then on."""
-    for k, one in enumerate(road.vehicles):
+    """Let highway-env check for collisions; vehicles that touch another body become `crashed`."""
+    for k, vehicle in enumerate(road.vehicles):
         for other in (*road.vehicles[k + 1 :], *road.objects):
-            one.handle_collisions(other, period)
+            vehicle.handle_collisions(other, period)
 
 
 @lru_cache(maxsize=64)
 def path_of(scene: Scene, lane: int, limits: SpeedLimits) -> ReferencePath:
-    """Reference path of a scene's route from a lane of its first road.
+    """Make the reference path of a scene's route, starting on a lane of its first road.
 
     Raises
     ------
@@ -181,14 +193,14 @@ def path_of(scene: Scene, lane: int, limits: SpeedLimits) -> ReferencePath:
 
 
 class NetworkEnv(AbstractEnv):
-    """An environment of highway-env on any network: IDM vehicles on its lanes, at random.
+    """highway-env environment on any road network, with IDM vehicles at random on its lanes.
 
-    The ego vehicle starts on the first road of the route, on a lane drawn at random. It makes roads
-    only, and is never stepped.
+    The ego vehicle starts on the first road of the route, on a random lane. The environment only
+    makes roads and traffic; it is never stepped.
     """
 
     APART = 20.0
-    """m between vehicles at the start."""
+    """Least distance between vehicles at the start, m."""
 
     def __init__(
         self, network: RoadNetwork, route: Sequence[str], config: Mapping[str, Any]
@@ -201,7 +213,7 @@ class NetworkEnv(AbstractEnv):
 
     @classmethod
     def default_config(cls) -> dict[str, Any]:
-        """highway-env's, with traffic, and neighbours seen across the ends of lanes."""
+        """highway-env's default configuration, with traffic and neighbours across ends of lanes."""
         config: dict[str, Any] = super().default_config()
         config |= {"other_vehicles": 5, "neighbour_vehicles_connected_lanes": True}
         return config
@@ -218,9 +230,36 @@ class NetworkEnv(AbstractEnv):
             place = self.np_random.uniform(0.0, self._network.get_lane(index).length)
             speed = self.np_random.uniform(6.0, 9.0)
             other = IDMVehicle.make_on_lane(self.road, index, longitudinal=place, speed=speed)
-            near = (
-                np.hypot(*(other.position - one.position)) < self.APART
-                for one in self.road.vehicles
-            )
-            if not any(near):
+            distances = [
+                np.hypot(*(other.position - vehicle.position)) for vehicle in self.road.vehicles
+            ]
+            if min(distances) >= self.APART:
                 self.road.vehicles.append(other)
+
+
+def scenery(network: RoadNetwork) -> Scenery:
+    """Return the surfaces and painted lines of all lanes, for the renderer."""
+    surfaces: list[Array] = []
+    lines: list[tuple[Array, bool]] = []
+    for lane in network.lanes_list():
+        at = np.linspace(0.0, lane.length, max(int(np.ceil(lane.length / EDGE_SPACING)), 1) + 1)
+        # highway-env's lateral coordinate grows towards the left of a path here.
+        edges = [_edge(lane, at, side) for side in (-0.5, 0.5)]
+        step = max(int(SURFACE_LENGTH / EDGE_SPACING), 1)
+        for k in range(0, len(at) - 1, step):
+            part = slice(k, k + step + 1)
+            surfaces.append(np.vstack([edges[0][part], edges[1][part][::-1]]))
+        for edge, kind in zip(edges, lane.line_types, strict=True):
+            if kind != LineType.NONE:
+                lines.append((edge, kind == LineType.STRIPED))
+    return Scenery(surfaces, lines)
+
+
+def _edge(lane: AbstractLane, at: Array, side: float) -> Array:
+    return np.array([lane.position(s, side * lane.width_at(s)) for s in at], dtype=np.float64)
+
+
+def bodies(others: Sequence[RoadObject]) -> Array:
+    """Return bodies for the renderer, (m, 5): X m, Y m, heading rad, length m, width m."""
+    rows = [(*body.position, body.heading, body.LENGTH, body.WIDTH) for body in others]
+    return np.array(rows, dtype=np.float64).reshape(-1, 5)

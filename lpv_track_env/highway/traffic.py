@@ -1,4 +1,8 @@
-"""Who is in the way on a path: other vehicles in the terms of adaptive cruise control."""
+"""The vehicle among others: what the traffic sees of it, who is ahead, and a reference that yields.
+
+Gaps and speeds of the vehicles ahead are measured along the path, as adaptive cruise control needs
+them.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -7,28 +11,90 @@ from typing import NamedTuple
 import numpy as np
 from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle
+from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import RoadObject
 from numpy.typing import ArrayLike, NDArray
 
-from lpv_track_env.highway.cruise import CruiseControl, Leader
+from lpv_track_env.bicycle import PSI, VX, VY, X, Y
+from lpv_track_env.highway.cruise import CruiseControl, Leader, lower_speed
+from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 
 Array = NDArray[np.float64]
 
 FORESEEN = (0.75, 1.5, 2.25, 3.0)
-"""s ahead, at which vehicles that follow their lanes at constant speed are looked for again."""
+"""Times, s, at which the positions of vehicles that follow their lanes are predicted."""
+NOBODY = Leader(math.inf, math.nan)
+"""Stands for a free road."""
+STEP = 0.05
+"""Step of a cruise control's profile, s."""
+BEYOND = 1.0
+"""Time that a profile extends beyond an agent's preview, s."""
+
+
+def body_centre(state: Array, vehicle: VehicleParameters) -> Array:
+    """Centre of the body (2,), m: midway between the axles, highway-env's position of a vehicle."""
+    ahead = 0.5 * (vehicle.front_axle_distance - vehicle.rear_axle_distance)
+    heading = float(state[PSI])
+    return np.array([state[X] + ahead * math.cos(heading), state[Y] + ahead * math.sin(heading)])
+
+
+class EgoVehicle(Vehicle):
+    """The environment's vehicle as the traffic of highway-env sees it.
+
+    The environment moves it: `place` puts it at the plant's state, `act` and `step` do nothing.
+    """
+
+    def __init__(self, road: Road, vehicle: VehicleParameters) -> None:
+        self.parameters = vehicle
+        self.LENGTH, self.WIDTH = vehicle.length, vehicle.width
+        self.target_speed = 0.0
+        self._velocity = np.zeros(2)
+        super().__init__(road, (0.0, 0.0))
+
+    def place(self, state: Array, reference_speed: float) -> None:
+        """Move the vehicle to the plant's state.
+
+        Parameters
+        ----------
+        state
+            [vx, vy, psi, r, X, Y], shape (6,).
+        reference_speed
+            m/s, the speed that the traffic takes for this vehicle's target speed.
+        """
+        heading = float(state[PSI])
+        c, s = math.cos(heading), math.sin(heading)
+        vx, vy = float(state[VX]), float(state[VY])
+        self.position = body_centre(state, self.parameters)
+        # highway-env compares headings modulo whole turns.
+        self.heading, self.speed = heading, vx
+        self._velocity = np.array([c * vx - s * vy, s * vx + c * vy])
+        self.target_speed = reference_speed
+        self.on_state_update()
+
+    @property
+    def velocity(self) -> Array:
+        """Velocity in the world (2,), m/s, including sideslip, unlike highway-env's own."""
+        return self._velocity
+
+    def act(self, action: object = None) -> None:
+        """Do nothing: the environment's action goes to the plant."""
+
+    def step(self, dt: float) -> None:
+        """Do nothing: `place` moves the vehicle."""
 
 
 def others_on(road: Road, ego: RoadObject | None) -> list[RoadObject]:
-    """Every body on a road but one: highway-env's vehicles and objects."""
-    return [one for one in (*road.vehicles, *road.objects) if one is not ego]
+    """All vehicles and objects on a road except the ego vehicle."""
+    return [body for body in (*road.vehicles, *road.objects) if body is not ego]
 
 
-class Sighting(NamedTuple):
-    """A body seen from a path: at an arc length, m, with how much of it reaches to each side.
+class Located(NamedTuple):
+    """A body in the coordinates of a path.
 
-    `offset`, m, and `across`, m/s, are positive to the left; `along` is m/s, `half_length` and
-    `half_width`, m, are measured along the path and across it.
+    `arc_length` and `offset` are m, `along` and `across` the velocity, m/s; lateral values are
+    positive to the left. `half_length` and `half_width`, m, are measured along and across the path.
     """
 
     arc_length: float
@@ -39,17 +105,17 @@ class Sighting(NamedTuple):
     half_width: float
 
 
-class Watch:
-    """The part of a path that lies ahead of a vehicle.
+class Stretch:
+    """The part of a path ahead of a vehicle.
 
     Parameters
     ----------
     path
-        The vehicle's reference.
+        Reference path of the vehicle.
     arc_length
-        Of its foot point, m.
+        Arc length of the vehicle's foot point, m.
     reach
-        m ahead.
+        Length of the stretch, m.
     """
 
     def __init__(self, path: ReferencePath, arc_length: float, reach: float) -> None:
@@ -59,21 +125,21 @@ class Watch:
         nodes = nodes % last if path.closed else nodes[nodes <= last]
         self._x, self._y, self._heading = path.x[nodes], path.y[nodes], path.heading[nodes]
 
-    def see(
+    def locate(
         self, body: RoadObject, position: ArrayLike, heading: float, velocity: ArrayLike
-    ) -> Sighting | None:
-        """A body with some position (2,), heading and velocity (2,); None unless it is beside."""
+    ) -> Located | None:
+        """Locate a body of some position (2,), heading and velocity (2,); None if not beside."""
         ox, oy = np.asarray(position)
         squared = (self._x - ox) ** 2 + (self._y - oy) ** 2
         nearest = int(squared.argmin())
-        # Nearest to an end of what is watched: behind the vehicle, or further off.
+        # Nearest to an end of the stretch: behind the vehicle, or beyond the stretch.
         if nearest in {0, len(self._x) - 1}:
             return None
         c, s = math.cos(self._heading[nearest]), math.sin(self._heading[nearest])
         vx, vy = np.asarray(velocity)
         turned = heading - self._heading[nearest]
         along, across = abs(math.cos(turned)), abs(math.sin(turned))
-        return Sighting(
+        return Located(
             (self._first + nearest) * self._spacing,
             float(c * (oy - self._y[nearest]) - s * (ox - self._x[nearest])),
             float(c * vx + s * vy),
@@ -91,70 +157,71 @@ def leaders(
     others: Sequence[RoadObject],
     cruise: CruiseControl,
 ) -> list[Leader]:
-    """Vehicles ahead that are in the way, or will be.
+    """Find the bodies ahead that block the path, or will block it.
 
-    Who will be in the way is what it has moved over, keeping its lateral speed, within the time of
-    a cut-in; and who comes into it on its own lane, as at a merge or a roundabout. The latter
-    count from where they would have been on the path by now: then one of two that approach a merge
-    from the same distance gives way.
+    A body will block the path if it moves into it sideways at its present lateral speed within the
+    time of a cut-in, or if its own lane leads into it, as at a merge or a roundabout. In the second
+    case its place is projected back: the arc length that it will reach on the path, minus the
+    distance that it covers until then. So of two vehicles that approach a merge from the same
+    distance, one yields.
 
     Parameters
     ----------
     path
-        The vehicle's reference.
+        Reference path of the vehicle.
     arc_length
-        Of its foot point, m.
+        Arc length of its foot point, m.
     front
-        m from its foot point to its front bumper.
+        Distance from its foot point to its front bumper, m.
     half_width
-        m, of its body.
+        Half width of its body, m.
     others
-        What else is on the road.
+        Other bodies on the road.
     cruise
-        Settings.
+        Range, side clearance and time of a cut-in.
     """
-    watch = Watch(path, arc_length, cruise.range)
+    stretch = Stretch(path, arc_length, cruise.range)
     bumper = arc_length + front
     found = []
     for other in others:
-        seen = watch.see(other, other.position, other.heading, other.velocity)
-        if seen is not None and _blocks(seen, half_width, cruise):
-            found.append(Leader(seen.arc_length - seen.half_length - bumper, seen.along))
+        now = stretch.locate(other, other.position, other.heading, other.velocity)
+        if now is not None and _blocks(now, half_width, cruise):
+            found.append(Leader(now.arc_length - now.half_length - bumper, now.along))
             continue
-        for time, later in _foreseen(other, watch):
+        for time, later in _predicted(other, stretch):
             if _blocks(later, half_width, cruise):
-                by_now = later.arc_length - later.along * time
-                # Who would be behind the front bumper comes after.
-                if by_now + later.half_length > bumper:
-                    found.append(Leader(by_now - later.half_length - bumper, later.along))
+                arc_length_now = later.arc_length - later.along * time
+                # A body behind the front bumper will follow this vehicle.
+                if arc_length_now + later.half_length > bumper:
+                    found.append(Leader(arc_length_now - later.half_length - bumper, later.along))
                 break
     return found
 
 
-def _blocks(seen: Sighting, half_width: float, cruise: CruiseControl) -> bool:
-    """Whether a body is in the way, or comes into it sideways."""
-    reach = half_width + seen.half_width + cruise.side_clearance
-    coming = seen.offset + seen.across * cruise.cut_in_time
-    return min(abs(seen.offset), abs(coming)) <= reach or seen.offset * coming < 0.0
+def _blocks(body: Located, half_width: float, cruise: CruiseControl) -> bool:
+    """Return whether a body blocks the path, or will soon move into it sideways."""
+    reach = half_width + body.half_width + cruise.side_clearance
+    soon = body.offset + body.across * cruise.cut_in_time
+    return min(abs(body.offset), abs(soon)) <= reach or body.offset * soon < 0.0
 
 
-def _foreseen(other: RoadObject, watch: Watch) -> Iterator[tuple[float, Sighting]]:
-    """Times, s, and what will be seen of a vehicle that goes on along its lane."""
+def _predicted(other: RoadObject, stretch: Stretch) -> Iterator[tuple[float, Located]]:
+    """Predict a vehicle that goes on along its lane: times, s, and where it is beside the path."""
     if not isinstance(other, ControlledVehicle) or other.crashed:
         return
     for time in FORESEEN:
         position, heading = _along_lanes(other, other.speed * time)
         velocity = other.speed * np.array([math.cos(heading), math.sin(heading)])
-        seen = watch.see(other, position, heading, velocity)
-        if seen is not None:
-            yield time, seen
+        located = stretch.locate(other, position, heading, velocity)
+        if located is not None:
+            yield time, located
 
 
 def _along_lanes(other: ControlledVehicle, distance: float) -> tuple[Array, float]:
-    """Position (2,), m, and heading, rad, of a vehicle some distance on along its route's lanes.
+    """Position (2,), m, and heading, rad, of a vehicle after a distance (m) along its lanes.
 
-    Where its route does not say which road follows and there are several, it goes straight on.
-    (highway-env's own prediction fails where a road has fewer lanes than the one before.)
+    Where several roads follow and its route names none of them, it goes straight on. (highway-env's
+    own prediction fails where a road has fewer lanes than the one before.)
     """
     network = other.road.network
     index, planned = other.lane_index, {step[0]: step[1] for step in other.route or ()}
@@ -172,3 +239,65 @@ def _along_lanes(other: ControlledVehicle, distance: float) -> tuple[Array, floa
         index = (node, after, int(np.argmin(apart)))
         lane = network.get_lane(index)
     return lane.position(s, 0.0), float(lane.heading_at(s))
+
+
+class TrafficReference:
+    """Reference of a vehicle in traffic: a path's table whose speeds keep the gap.
+
+    Parameters
+    ----------
+    path
+        Path to follow, at its own speed on a free road.
+    vehicle
+        Vehicle whose body counts for gaps.
+    layout
+        Layout of the observation: the speeds are lowered at least as far as its preview reaches.
+    cruise
+        Settings of the gap; None keeps the path's own speed whoever is ahead.
+
+    Attributes
+    ----------
+    table
+        (n, 8), the path's table with the present speeds and times; changed in place.
+    leader
+        The vehicle ahead: gap (inf if there is none) and speed (NaN).
+    """
+
+    def __init__(
+        self,
+        path: ReferencePath,
+        vehicle: VehicleParameters,
+        layout: ObservationLayout,
+        cruise: CruiseControl | None,
+    ) -> None:
+        self.path, self.cruise = path, cruise
+        self.table: Array = path.table.copy()
+        self.leader = NOBODY
+        middle = 0.5 * (vehicle.front_axle_distance - vehicle.rear_axle_distance)
+        self._front, self._half_width = middle + 0.5 * vehicle.length, 0.5 * vehicle.width
+        self._steps = math.ceil((layout.preview_steps * layout.preview_period + BEYOND) / STEP)
+        self._settings = cruise or CruiseControl()
+        self._lowered = False
+
+    def update(self, arc_length: float, speed: float, others: Sequence[RoadObject]) -> None:
+        """Find the vehicle ahead, and lower the speeds to keep the gap.
+
+        Parameters
+        ----------
+        arc_length, speed
+            Arc length and speed of this vehicle, m and m/s.
+        others
+            Other bodies on the road.
+        """
+        ahead = leaders(
+            self.path, arc_length, self._front, self._half_width, others, self._settings
+        )
+        self.leader = min(ahead, default=NOBODY)
+        if self.cruise is None:
+            return
+        if ahead:
+            profile = self.cruise.profile(arc_length, speed, ahead, STEP, self._steps)
+            lower_speed(self.path, self.table, *profile)
+        elif self._lowered:
+            self.table[:] = self.path.table
+        self._lowered = bool(ahead)

@@ -1,4 +1,4 @@
-"""The other way round: agents of path tracking at the wheel of highway-env's own vehicle."""
+"""Agents of path tracking in highway-env's own environments, driving its own vehicle."""
 
 import math
 from collections.abc import Sequence
@@ -16,9 +16,8 @@ from lpv_track_env import kernels
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.conditions import Actuation
 from lpv_track_env.highway.cruise import CruiseControl
-from lpv_track_env.highway.reference import TrafficReference
 from lpv_track_env.highway.routes import lane_route, reference_path, road_ahead
-from lpv_track_env.highway.traffic import others_on
+from lpv_track_env.highway.traffic import TrafficReference, others_on
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task
@@ -31,17 +30,18 @@ LIMITS = SpeedLimits(max_speed=10.0, max_lateral_acceleration=2.0, max_accelerat
 
 
 def vehicle_of(env: AbstractEnv) -> VehicleParameters:
-    """highway-env's vehicle in this project's terms, with the bounds of an environment's action.
+    """Describe highway-env's vehicle by parameters, with the bounds of an environment's action.
 
-    Its kinematic bicycle turns by v sin(beta) / (L / 2), tan(beta) = tan(delta) / 2, with L the
-    length of its body: a wheelbase of L, the centre of gravity in the middle. Without slip it has
-    no tyres; the stiffness here gives a neutral vehicle the same turns, with 2 degrees of slip at
-    5 m/s^2. Nothing there limits rates: the steering's is what a driver can do.
+    Its kinematic bicycle has the yaw rate v sin(beta) / (L / 2), tan(beta) = tan(delta) / 2, with L
+    the length of its body: a wheelbase of L, the centre of gravity in the middle. It has no slip
+    and so no tyres; the stiffness here gives a neutral vehicle the same turns, with 2 degrees of
+    slip at 5 m/s^2. highway-env limits no rates; the steering rate here is one that a driver can
+    reach.
 
     Raises
     ------
     ValueError
-        If the environment's action is not continuous, or its vehicle one with dynamics.
+        If the environment's action is not continuous, or its vehicle has dynamics.
     """
     action = env.action_type
     if not (isinstance(action, ContinuousAction) and type(action) is ContinuousAction):
@@ -79,11 +79,11 @@ def vehicle_of(env: AbstractEnv) -> VehicleParameters:
 
 
 class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment of highway-env that takes and gives what this project's agents know.
+    """Environment of highway-env with the observation and action of this project's agents.
 
-    Its vehicle, its simulation, its reward and ends are highway-env's own. The observation is that
-    of path tracking (`lpv_track_env.observation`) along the vehicle's route, the action
-    [acceleration m/s^2, steering angle rad]; so `agents.make("lpv-nmpc", env)` drives it::
+    Vehicle, simulation, reward and ends are highway-env's own. The observation is the one of path
+    tracking (`lpv_track_env.observation`) along the vehicle's route, the action is [acceleration
+    m/s^2, steering angle rad]; so `agents.make("lpv-nmpc", env)` can drive it::
 
         env = HighwayTracking(
             gymnasium.make("racetrack-v1", config={"action": {"type": "ContinuousAction"}})
@@ -93,31 +93,31 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         action, record = agent.predict(observation)
         observation, reward, terminated, truncated, info = env.step(action)
 
-    The control period is one of the environment's policy; a `policy_frequency` of 10 or more gives
-    a controller something to control. Where its action has no throttle, the reference's speed is
-    the one that the vehicle has, and no gap is kept.
+    The control period is the period of the environment's policy; controllers need a
+    `policy_frequency` of 10 or more. If the environment's action has no throttle, the reference has
+    the vehicle's speed, and no gap is kept.
 
-    Infos have, beside highway-env's, `lateral_error`, `heading_error`, `speed_error`, `arc_length`
-    and `state` as in path tracking, and `gap`.
+    In addition to highway-env's, infos contain `lateral_error`, `heading_error`, `speed_error`,
+    `arc_length` and `state` as in path tracking, and `gap`.
 
     Parameters
     ----------
     env
-        highway-env's, with a `ContinuousAction` and its kinematic vehicle.
+        highway-env's environment with a `ContinuousAction` and the kinematic vehicle.
     route
-        Names of the nodes to pass, the first two of the road on which the vehicle starts; by
-        default the road goes on to its end, or around a lap.
+        Names of the nodes to pass; the first two are the road on which the vehicle starts. By
+        default the road is followed to its end, or around a lap.
     cruise
-        Settings of the gap that is kept, or None.
+        Settings of the gap to keep, or None.
     speed_limits
-        Of the reference.
+        Speed limits of the reference.
     preview_steps
-        K, of a control period each.
+        Number K of preview steps, each of a control period.
 
     Raises
     ------
     ValueError
-        If the environment is none of highway-env's, or its action cannot be driven with.
+        If the environment is not highway-env's, or its action or vehicle is not supported.
     """
 
     def __init__(
@@ -152,11 +152,11 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     @property
     def path(self) -> ReferencePath:
-        """The reference path of the current episode."""
+        """Reference path of the current episode."""
         return self._reference.path
 
     def _begin(self) -> None:
-        """Lay the reference from where the vehicle starts."""
+        """Begin an episode: make the reference from the place where the vehicle starts."""
         network, start = self.highway.road.network, self.highway.vehicle
         begin, end, lane = start.lane_index
         nodes = road_ahead(network, begin, end) if self.route is None else self.route
@@ -177,7 +177,7 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._observation = np.zeros(self.layout.size, dtype=np.float32)
 
     def _observe(self, ahead: float) -> NDArray[np.float32]:
-        """Observe the vehicle, its foot point about `ahead` m from the last."""
+        """Observe the vehicle, whose foot point is about `ahead` m after the last one."""
         car, record = self.highway.vehicle, self._record
         steering = float(car.action["steering"])
         slip = math.atan(0.5 * math.tan(steering))
@@ -192,10 +192,10 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         )
         return self._observation.copy()
 
-    def _look_ahead(self) -> None:
+    def _follow_traffic(self) -> None:
         road, car = self.highway.road, self.highway.vehicle
         s = float(self._record[kernels.ARC_LENGTH])
-        self._reference.look(s, float(car.speed), others_on(road, car))
+        self._reference.update(s, float(car.speed), others_on(road, car))
 
     def _info(self) -> dict[str, Any]:
         m = self._record
@@ -215,7 +215,7 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         _, info = self.env.reset(seed=seed, options=options)
         self._begin()
         observation = self._observe(0.0)
-        self._look_ahead()
+        self._follow_traffic()
         return observation, {**info, **self._info()}
 
     def step(
@@ -233,5 +233,5 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         ahead = float(self.highway.vehicle.speed) * self.control_period
         _, reward, terminated, truncated, info = self.env.step(given)
         observation = self._observe(ahead)
-        self._look_ahead()
+        self._follow_traffic()
         return observation, reward, bool(terminated), bool(truncated), {**info, **self._info()}
