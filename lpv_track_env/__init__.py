@@ -18,6 +18,9 @@ PATH_TRACKING = "lpv_track_env/PathTracking-v0"
 WEIGHT_TUNING = "lpv_track_env/WeightTuning-v0"
 HIGHWAY_TRACK = "lpv_track_env/HighwayTrack-v0"
 
+COMPILED_LIBRARY = True
+"""Compiled functions of other packages may use this one; see `trajectories.compilation`."""
+
 if PATH_TRACKING not in gymnasium.registry:
     gymnasium.register(
         id=PATH_TRACKING,
