@@ -41,7 +41,7 @@ def truth() -> dict[str, Topic]:
 
 
 def test_perfect_sensors_show_the_truth_again(tmp_path: Path) -> None:
-    """The estimate is what was driven, and the agent that drove proposes what it did."""
+    """The estimate equals the driven states, and the same agent proposes the recorded commands."""
     write(tmp_path / "a.bag", truth())
     done = replayed(tmp_path / "a.bag")
     trace = driven()

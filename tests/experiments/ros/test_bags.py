@@ -50,12 +50,12 @@ def written(folder: Path, bag_format: str, topics: dict[str, Topic]) -> Path:
 
 @pytest.fixture(scope="module", params=FORMATS)
 def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run's bag in one of the formats; not to be changed."""
+    """Bag of a run in one of the formats, read-only."""
     return written(tmp_path_factory.mktemp("bags"), request.param, topics_of(driven()))
 
 
 def odometry(stamp: Any, **changes: Any) -> Odometry:
-    """Odometry of standing still, for the stamps given."""
+    """Return the odometry of a standing vehicle at some stamps."""
     n = len(stamp)
     columns = {name: np.zeros(n) for name in Odometry.columns()}
     return Odometry(np.asarray(stamp), **{**columns, **changes})
@@ -85,7 +85,7 @@ def test_a_run_comes_back(bag: Path) -> None:
 
 
 def test_what_others_read(bag: Path) -> None:
-    """rosbags' own reader, which takes the definitions that stand in the bag."""
+    """Read with rosbags' own reader, which uses the definitions in the bag."""
     trace, k = driven(), 100
     found: dict[str, list[Any]] = {}
     with AnyReader([bag]) as reader:
@@ -121,7 +121,7 @@ def test_what_others_read(bag: Path) -> None:
 
 
 def test_an_imu_feels_what_turns_and_what_speeds_up() -> None:
-    """Faster and faster round a circle, slipping a little: a = v' + r x v by hand."""
+    """Accelerate on a circle with sideslip: a = v' + r x v by hand."""
     time = np.arange(0.0, 5.0, 0.05)
     zero = np.zeros_like(time)
     speed, rate = 2.0 + 0.5 * time, 0.2 + zero
@@ -179,7 +179,7 @@ def logged(
     change: Callable[[int, Any], None] = lambda _k, _m: None,
     topics: tuple[str, ...] = ("/odom",),
 ) -> Path:
-    """Odometry with any stamps in the order given, x their place, logged one a second."""
+    """Write odometry with any stamps in the given order, x their index, logged once a second."""
     store = get_typestore(Stores.ROS1_NOETIC)
     orderly = odometry(SECOND * np.arange(1, len(stamps) + 1), x=np.arange(float(len(stamps))))
     with rosbags.Writer(file) as writer:
@@ -251,7 +251,7 @@ def test_another_layout_of_a_type_is_refused(tmp_path: Path) -> None:
 
 
 def test_definitions_in_a_bag_are_not_run(tmp_path: Path) -> None:
-    """Those of other topics may be anything: they are not even parsed."""
+    """Definitions of other topics are not even parsed."""
     stamp = SECOND * np.arange(1, 4)
     with rosbags.Writer(tmp_path / "a.bag") as writer:
         odd = writer.add_connection(
@@ -358,7 +358,7 @@ def test_foreign_files(tmp_path: Path) -> None:
 
 @each_format
 def test_damaged_bags_fail_in_one_line(tmp_path: Path, bag_format: str) -> None:
-    """Torn and flipped at random: an error of one line, or what could still be read."""
+    """Truncated or with random bit flips: one line of error, or the readable messages."""
     rng = np.random.default_rng(0)
     bag = written(tmp_path, bag_format, {"/odom": odometry(SECOND * np.arange(1, 61))})
     source = bag if bag.is_file() else next(f for f in bag.iterdir() if f.suffix != ".yaml")
@@ -390,7 +390,7 @@ def test_damaged_bags_fail_in_one_line(tmp_path: Path, bag_format: str) -> None:
 
 
 def test_ros_2_types_are_those_of_every_distribution() -> None:
-    """The hashes of what is written do not depend on the distribution."""
+    """The hashes of the written types do not depend on the distribution."""
     for store in Stores:
         if not store.name.startswith("ROS2"):
             continue
@@ -400,7 +400,7 @@ def test_ros_2_types_are_those_of_every_distribution() -> None:
 
 
 def test_definitions_are_those_that_ros_ships() -> None:
-    """MD5 sums of ackermann_msgs and geographic_msgs as their generated headers have them."""
+    """Compare with the MD5 sums in the generated headers of ackermann_msgs, geographic_msgs."""
     store = typestore(ROS1)
     sums = {
         "ackermann_msgs/msg/AckermannDriveStamped": "1fd5d7f58889cefd44d29f6653240d0c",

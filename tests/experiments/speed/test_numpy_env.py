@@ -1,4 +1,4 @@
-"""The NumPy yardstick drives the same episodes as the compiled environment."""
+"""The environment in NumPy drives the same episodes as the compiled one."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""`lpv-track speed`: what it writes, how its ratios are made, what it says when something lacks."""
+"""`lpv-track speed`: its files, its ratios, and its messages when a package is missing."""
 
 import importlib
 import json
@@ -40,7 +40,7 @@ MEASURED = ["single", "vector", "solvers", "batches", "tuning", "rendering"]
 
 
 def quietly(text: str) -> None:
-    """No progress."""
+    """Show no progress."""
 
 
 def speed(folder: Path, *arguments: str) -> int:
@@ -66,7 +66,7 @@ def shown(result: dict[str, Any]) -> str:
     return capture.get()
 
 
-# What is written -----------------------------------------------------------------------------
+# Written files -------------------------------------------------------------------------------
 
 
 def test_the_json_holds_every_round_the_machine_and_the_settings(tiny: Path) -> None:
@@ -187,7 +187,7 @@ def test_quantities(value: float, unit: str, text: str) -> None:
     assert display.quantity(value, unit) == text
 
 
-# What lacks, and what goes wrong -------------------------------------------------------------
+# Missing packages and errors ----------------------------------------------------------------
 
 
 def test_a_missing_package_is_one_line_and_the_rest_goes_on(
@@ -205,7 +205,7 @@ def test_a_missing_package_is_one_line_and_the_rest_goes_on(
 
 
 @pytest.mark.parametrize("name", ["gymnax", "envpool", "stable_baselines3"])
-def test_every_optional_package_is_told_how_to_be_had(
+def test_a_missing_package_names_the_command_that_installs_it(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, name, None)
@@ -255,7 +255,7 @@ def test_ctrl_c_keeps_what_was_measured(
     assert signal.getsignal(signal.SIGINT) is before
 
 
-# How it is measured --------------------------------------------------------------------------
+# Measuring -----------------------------------------------------------------------------------
 
 
 def test_rounds_go_in_turn() -> None:
@@ -310,7 +310,7 @@ def test_of_many_rounds_there_is_a_99th_percentile() -> None:
 
 
 class Clock:
-    """A clock that goes when it is told to."""
+    """Clock that advances only when a step or a reset advances it."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -320,7 +320,7 @@ class Clock:
 
 
 class Counted:
-    """An environment of 7-step episodes: a step takes 1 s of its clock, a reset 1000 s."""
+    """Environment with episodes of 7 steps; a step takes 1 s of its clock, a reset 1000 s."""
 
     def __init__(self, clock: Clock) -> None:
         self.clock, self.resets, self.steps, self.left = clock, 0, 0, 0
