@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from experiments.commands.options import EXIT_INTERRUPTED, EXIT_USAGE
-from experiments.run.process import one_thread
+from experiments.run.engines import one_thread
 
 COMMANDS = {
     "benchmark": "Run agents x trajectories x seeds, print the paper's table, write report.html.",

@@ -11,9 +11,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from experiments.agent_words import agent_notes, world_plan
-from experiments.highway.drives import TrafficDrive
-from experiments.run.case import Case
-from experiments.run.process import Interrupts
+from experiments.run.case import BaseCase
+from experiments.run.engines import Interrupts
 from experiments.run.rollout import Rollout, steps
 from experiments.sinks import PngSink, Sink, VideoSink, WindowSink
 
@@ -34,7 +33,7 @@ class Drive:
         What the path is coloured by, see `lpv_track_env.rendering.Renderer`.
     """
 
-    def __init__(self, case: Case | TrafficDrive, colour: str) -> None:
+    def __init__(self, case: BaseCase, colour: str) -> None:
         self.case = case
         self._env = case.make_env(render_mode="rgb_array", render_colour=colour)
         self._inner: Any = self._env.unwrapped
@@ -79,7 +78,7 @@ class Drive:
 
 
 def drive(
-    cases: Sequence[Case | TrafficDrive],
+    cases: Sequence[BaseCase],
     console: Console,
     *,
     frames: Path | None = None,
@@ -192,7 +191,7 @@ def _tell(one: Drive, console: Console) -> None:
     trace = one.done.trace
     worst = float(np.abs(trace.lateral_error).max())
     console.print(
-        f"{one.case.agent} on {one.case.trajectory}: {one.done.end} after {trace.time[-1]:.1f} s, "
+        f"{one.case.agent} on {one.case.place}: {one.done.end} after {trace.time[-1]:.1f} s, "
         f"largest lateral error {worst:.3f} m",
         markup=False, highlight=False, soft_wrap=True,
     )  # fmt: skip

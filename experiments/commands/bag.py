@@ -164,7 +164,7 @@ def _export(options: argparse.Namespace, console: Console) -> int:
     from experiments.ros.runs import DATUM, measured, topics_of
     from experiments.ros.write import refuse_existing, ros_version, write
     from experiments.run.case import Case
-    from experiments.run.process import Interrupts
+    from experiments.run.engines import Interrupts
     from experiments.run.rollout import rollout
     from lpv_track_env.conditions import load as load_conditions
 

@@ -98,9 +98,11 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
     return settings
 
 
-def add_agents(parser: argparse.ArgumentParser, meaning: str) -> None:
+def add_agents(
+    parser: argparse.ArgumentParser, meaning: str, default: list[str] | None = None
+) -> None:
     """Add `--agents` alias `--agent`, one name or several."""
-    _add_names(parser, "--agents", "--agent", help=meaning)
+    _add_names(parser, "--agents", "--agent", default=default, help=meaning)
 
 
 def add_trajectories(

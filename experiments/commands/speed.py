@@ -88,7 +88,7 @@ def _measure_all(
 ) -> dict[str, Any]:
     """Measure the chosen sections and write `speed.json` after each; Ctrl-C ends early."""
     from experiments.run.benchmark import progress_bar
-    from experiments.run.process import Interrupts
+    from experiments.run.engines import Interrupts
     from experiments.speed.measure import FULL, QUICK
 
     effort = QUICK if quick else FULL

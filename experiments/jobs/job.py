@@ -15,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
-from experiments.run.process import Interrupts
+from experiments.run.engines import Interrupts
 from experiments.run.provenance import file_digest
 from trajectories.fileio import write_atomically
 

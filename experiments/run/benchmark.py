@@ -1,7 +1,8 @@
-"""`lpv-track benchmark`: run cases, keep them, print the table, write the report."""
+"""Running cases: those that a folder lacks, with progress; then tables and the report."""
 
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,9 @@ from rich.progress import (
 
 from experiments.report.build import where, write_report
 from experiments.run import engines
-from experiments.run.case import Case
+from experiments.run.case import BaseCase, Case, run_case, worker_death
 from experiments.run.console_tables import screen
-from experiments.run.process import Interrupts
+from experiments.run.engines import Interrupts
 from experiments.run.store import ResultStore
 from experiments.run.tables import path_name
 
@@ -35,28 +36,34 @@ def distinct(specs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return list({Case(**spec).id: spec for spec in specs}.values())
 
 
-def check(specs: Sequence[Spec]) -> None:
-    """Check names and settings before anything runs.
-
-    Raises
-    ------
-    ValueError
-        For an unknown one, listing the known ones and the nearest.
-    """
-    for spec in specs:
-        Case(**spec).check()
-
-
 def run_benchmark(
     specs: Sequence[Spec],
     folder: Path,
     *,
     workers: int,
     settings: Mapping[str, Any],
-    resume: bool = True,
     console: Console,
+    resume: bool = True,
+    kind: type[BaseCase] = Case,
 ) -> ResultStore:
     """Run the cases that the folder does not hold yet, and store each as it ends.
+
+    Parameters
+    ----------
+    specs
+        Fields of the cases.
+    folder
+        Folder of the results.
+    workers
+        Number of processes.
+    settings
+        Entries of the manifest.
+    console
+        Receives the progress.
+    resume
+        Whether the folder may hold results already.
+    kind
+        Class of the cases.
 
     Raises
     ------
@@ -65,20 +72,22 @@ def run_benchmark(
     """
     if workers < 1:
         raise ValueError(f"workers must be at least 1, not {workers}")
-    check(specs)
+    for spec in specs:
+        kind(**spec).check()
+    by_id = {kind(**spec).id: spec for spec in specs}
     store = ResultStore(folder)
     known = {case["id"] for case in store.cases() if case["status"] == "ok"}
     if store.cases() and not resume:
         raise ValueError(f"{folder} holds results already: say --resume, or give another --out")
-    missing = [spec for spec in specs if Case(**spec).id not in known]
-    store.write_manifest({**settings, "cases": [Case(**spec).id for spec in specs]})
-    if len(missing) < len(specs):
+    missing = [spec for key, spec in by_id.items() if key not in known]
+    store.write_manifest({**settings, "cases": list(by_id)})
+    if len(missing) < len(by_id):
         console.print(
-            f"{len(specs) - len(missing)} of {len(specs)} cases are in {folder} already "
+            f"{len(by_id) - len(missing)} of {len(by_id)} cases are in {folder} already "
             "(same sources, same settings)"
         )
     if missing:
-        _run(missing, store, workers, console)
+        _run(missing, kind, store, min(workers, len(missing)), console)
     return store
 
 
@@ -97,8 +106,9 @@ def progress_bar(console: Console) -> Progress:
     )
 
 
-def _run(specs: Sequence[Spec], store: ResultStore, workers: int, console: Console) -> None:
-    workers = min(workers, len(specs))
+def _run(
+    specs: Sequence[Spec], kind: type[BaseCase], store: ResultStore, workers: int, console: Console
+) -> None:
     progress = progress_bar(console)
     began = time.perf_counter()
     with progress, Interrupts() as interrupts:
@@ -107,12 +117,13 @@ def _run(specs: Sequence[Spec], store: ResultStore, workers: int, console: Conso
         def started(spec: Spec) -> None:
             progress.update(bar, description=label(spec))
 
-        run = (
-            engines.in_process(specs, started=started)
+        run, died = (partial(function, kind=kind) for function in (run_case, worker_death))
+        results = (
+            engines.in_process(specs, run, started)
             if workers == 1
-            else engines.local_pool(specs, workers, started=started)
+            else engines.local_pool(specs, workers, run, died, started)
         )
-        for count, result in enumerate(run, start=1):
+        for count, result in enumerate(results, start=1):
             # Before the result is stored: a case may have taken Ctrl-C for a failed solve.
             interrupts.check()
             store.append(result)
@@ -130,13 +141,18 @@ def _run(specs: Sequence[Spec], store: ResultStore, workers: int, console: Conso
 
 def label(spec: Spec) -> str:
     """Return a short name of a case for a line of progress."""
-    return f"{spec['agent']} {path_name(spec['trajectory'])} {spec['vehicle']} {spec['speed_mode']}"
+    if "scene" in spec:
+        return f"{spec['agent']} {spec['scene']} seed {spec['seed']}"
+    path = path_name(spec["trajectory"])
+    return f"{spec['agent']} {path} {spec['vehicle']} {spec['speed_mode']}"
 
 
-def selected(store: ResultStore, specs: Sequence[Spec]) -> list[dict[str, Any]]:
+def selected(
+    store: ResultStore, specs: Sequence[Spec], kind: type[BaseCase] = Case
+) -> list[dict[str, Any]]:
     """Return the results of some specs, in their order."""
     by_id = {case["id"]: case for case in store.cases()}
-    return [by_id[key] for spec in specs if (key := Case(**spec).id) in by_id]
+    return [by_id[key] for spec in specs if (key := kind(**spec).id) in by_id]
 
 
 def finish(store: ResultStore, specs: Sequence[Spec], console: Console) -> int:

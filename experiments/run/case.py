@@ -1,11 +1,12 @@
-"""One case: a small plain dict in, a plain dict out. A benchmark is a list of cases."""
+"""Cases: a benchmark is a list of them, each a small plain dict in and a plain dict out."""
 
 import hashlib
 import inspect
 import json
 import time
 import warnings
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -21,6 +22,7 @@ from agents.base import CHECKPOINTS
 from agents.registry import check_settings, source_file
 from experiments.run import learning_cost, metrics
 from experiments.run.computing import ComputingTimes
+from experiments.run.provenance import file_digest
 from experiments.run.rollout import Rollout, rollout
 from lpv_track_env import conditions, plants, vehicle
 from lpv_track_env.env import PathTrackingEnv
@@ -32,17 +34,96 @@ from trajectories.naming import choose
 
 VEHICLE_FIELDS = tuple(field.name for field in fields(VehicleParameters))
 REWARD_FIELDS = tuple(field.name for field in fields(RewardWeights))
-ENV_SETTINGS = tuple(
-    parameter.name
-    for parameter in inspect.signature(PathTrackingEnv).parameters.values()
-    if parameter.kind is parameter.KEYWORD_ONLY
-)
-"""What `env_settings` may hold; the environment's other arguments are fields of the case."""
+
+
+def keyword_settings(function: Callable[..., Any]) -> tuple[str, ...]:
+    """Return the names of a function's keyword-only parameters.
+
+    Of an environment they are what `env_settings` may hold; its other arguments are fields of a
+    case.
+    """
+    parameters = inspect.signature(function).parameters.values()
+    return tuple(one.name for one in parameters if one.kind is one.KEYWORD_ONLY)
+
+
+class BaseCase(ABC):
+    """Everything that determines one episode; kinds of cases are frozen dataclasses."""
+
+    agent: str
+    seed: int
+    control_period: float
+    agent_settings: Mapping[str, Any]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields as plain values."""
+        return asdict(self)  # type: ignore[call-overload, no-any-return]
+
+    @property
+    def id(self) -> str:
+        """Hash of the case, of the files it names and of the project's sources."""
+        digests = [
+            file_digest(file) for file in self.files() if file is not None and file.is_file()
+        ]
+        content = json.dumps([self.as_dict(), digests, project_digest()], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+    def files(self) -> list[Path | None]:
+        """Return the files whose contents a result depends on, beside the project's sources."""
+        settings = [str(value) for value in self.agent_settings.values()]
+        return [
+            source_file(self.agent),
+            *(Path(value) for value in settings if value.endswith(".json")),
+            # A setting may name a checkpoint that is shipped beside the agent's default.
+            *(CHECKPOINTS / f"{self.agent}-{value}.json" for value in settings),
+        ]
+
+    @property
+    @abstractmethod
+    def place(self) -> str:
+        """Name of the trajectory or scene."""
+
+    @abstractmethod
+    def check(self) -> None:
+        """Raise ValueError for unknown names and settings, before anything is driven."""
+
+    @abstractmethod
+    def make_env(self, **settings: Any) -> gymnasium.Env[Any, Any]:
+        """Make the case's environment; `settings` are added to the case's own."""
+
+    def make_computing(self) -> ComputingTimes | None:
+        """Make the case's computing times; None leaves them to its conditions."""
+        return None
+
+    def make_agent(self, env: gymnasium.Env[Any, Any]) -> agents.Agent:
+        """Make the case's agent for its environment."""
+        return agents.make(self.agent, env, **self.agent_settings)
+
+    @abstractmethod
+    def drive(self, result: dict[str, Any]) -> None:
+        """Drive the episode and add its outcome to the result, such as `end` and `metrics`.
+
+        Entries that are added before an exception stay in the result of the failed case.
+        """
+
+    def failure(self, error: str) -> dict[str, Any]:
+        """Return the result of a case that failed."""
+        return {
+            "id": self.id,
+            **self.as_dict(),
+            "status": "failed",
+            "end": None,
+            "error": error,
+            "metrics": {},
+            "solver": {},
+            "warnings": [],
+            "seconds": 0.0,
+            "trace": {},
+        }
 
 
 @dataclass(frozen=True)
-class Case:
-    """Everything that determines one episode.
+class Case(BaseCase):
+    """An agent on a trajectory.
 
     `conditions` is a preset's name or a dictionary of fields, see `lpv_track_env.conditions.load`.
     `computing` turns computing times into delays: the arguments of
@@ -65,39 +146,22 @@ class Case:
     env_settings: Mapping[str, Any] = field(default_factory=dict)
     computing: Mapping[str, Any] = field(default_factory=dict)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
-
     @property
-    def id(self) -> str:
-        """Hash of the case, the files it names and the project's sources: none changes unseen."""
-        # A setting that names a .json, such as a learned policy's.
-        settings = (
-            Path(value)
-            for value in self.agent_settings.values()
-            if isinstance(value, str) and value.endswith(".json")
-        )
-        # One that names what is shipped for the agent, beside its default.
-        shipped = (CHECKPOINTS / f"{self.agent}-{v}.json" for v in self.agent_settings.values())
-        named = (
-            Path(self.trajectory), Path(self.vehicle), source_file(self.agent), *settings, *shipped,
-        )  # fmt: skip
-        files = [
-            hashlib.sha256(file.read_bytes()).hexdigest()
-            for file in named
-            if file is not None and file.is_file()
-        ]
-        content = json.dumps([self.as_dict(), files, project_digest()], sort_keys=True)
-        return hashlib.sha256(content.encode()).hexdigest()[:16]
+    def place(self) -> str:
+        """Name of the trajectory, or its file."""
+        return self.trajectory
+
+    def files(self) -> list[Path | None]:
+        """Return the files whose contents a result depends on, beside the project's sources."""
+        return [Path(self.trajectory), Path(self.vehicle), *super().files()]
 
     def check(self) -> None:
-        """Refuse names and settings that nothing knows, before anything is driven.
+        """Check names and settings, before anything is driven.
 
         Raises
         ------
         ValueError
-            Listing the known names and the nearest.
+            For an unknown one, listing the known ones and the nearest.
         """
         check_settings(self.agent, self.agent_settings)
         trajectories.load(self.trajectory)
@@ -107,14 +171,14 @@ class Case:
             raise ValueError("computing times are delays, which conditions 'simulation' have not")
         self.make_computing()
         for key in self.env_settings:
-            choose("environment setting", key, ENV_SETTINGS)
+            choose("environment setting", key, keyword_settings(PathTrackingEnv))
         self.resolved_env_settings()
         for key in self.vehicle_changes:
             choose("vehicle field", key, VEHICLE_FIELDS)
         plants.make(self.env_settings.get("plant", plants.BICYCLE), self.make_vehicle())
 
     def make_vehicle(self) -> VehicleParameters:
-        """The case's vehicle, with what is changed of it."""
+        """Return the case's vehicle with its changes."""
         changes = {
             key: tuple(value) if isinstance(value, list) else value
             for key, value in self.vehicle_changes.items()
@@ -123,11 +187,11 @@ class Case:
 
     @property
     def plain_conditions(self) -> str | dict[str, Any]:
-        """Conditions as the environment takes them; JSON's lists are ranges."""
+        """Conditions as `lpv_track_env.conditions.load` takes them."""
         return self.conditions if isinstance(self.conditions, str) else dict(self.conditions)
 
     def resolved_env_settings(self) -> dict[str, Any]:
-        """Settings as the environment takes them; a dictionary of reward weights is made one."""
+        """Return the settings as the environment takes them, with `RewardWeights` made."""
         settings = dict(self.env_settings)
         if isinstance(weights := settings.get("reward_weights"), Mapping):
             for key in weights:
@@ -136,7 +200,7 @@ class Case:
         return settings
 
     def make_env(self, **settings: Any) -> gymnasium.Env[Any, Any]:
-        """The case's environment; `settings` are added to the case's own."""
+        """Make the case's environment; `settings` are added to the case's own."""
         return gymnasium.make(
             "lpv_track_env/PathTracking-v0",
             trajectory=self.trajectory,
@@ -149,84 +213,85 @@ class Case:
         )
 
     def make_computing(self) -> ComputingTimes | None:
-        """The case's computing times; None: those of its conditions."""
+        """Make the case's computing times; None leaves them to its conditions."""
         if not self.computing:
             return None
         return ComputingTimes(**self.computing, period=self.control_period, seed=self.seed)
 
-    def make_agent(self, env: gymnasium.Env[Any, Any]) -> agents.Agent:
-        """The case's agent for its environment."""
-        return agents.make(self.agent, env, **self.agent_settings)
+    def drive(self, result: dict[str, Any]) -> None:
+        """Drive the episode and add its outcome to the result.
 
-
-@cache
-def project_digest() -> str:
-    """Digest of all sources that a result depends on."""
-    packages = (trajectories, lpv_track_env, agents)
-    folders = [Path(str(package.__file__)).parent for package in packages]
-    here = Path(__file__).parent
-    names = ("case", "rollout", "metrics", "computing", "learning_cost")
-    own = "".join((here / f"{name}.py").read_text() for name in names)
-    return hashlib.sha256((source_digest(*folders) + own).encode()).hexdigest()[:16]
-
-
-def run_case(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Run one case; never raises for what the case itself does wrong.
-
-    Parameters
-    ----------
-    spec
-        Fields of `Case`.
-
-    Returns
-    -------
-    dict
-        `id`, the spec's fields, `status` ("ok" or "failed" with `error`), `end`, `metrics`,
-        `solver` (median, p99, max time in s; failures), `warnings`, `seconds`, and `trace`, arrays
-        by name; for a learned policy `training`, what it cost (`experiments.run.learning_cost`).
-    """
-    case = Case(**spec)
-    result: dict[str, Any] = {"id": case.id, **case.as_dict(), "status": "ok", "end": None}
-    began = time.perf_counter()
-    try:
+        Added are `end`, `metrics`, `solver` (median, p99, max time in s; failures), `warnings`, and
+        `trace`, arrays by name; for a learned policy `training`, the cost of making it
+        (`experiments.run.learning_cost`); with computing times `latency`.
+        """
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
-            env = case.make_env()
-            computing = case.make_computing()
-            agent = case.make_agent(env)
+            env = self.make_env()
+            computing = self.make_computing()
+            agent = self.make_agent(env)
             result |= learning_cost.of_agent(agent)
-            driven = rollout(env, agent, seed=case.seed, computing_time=computing)
+            driven = rollout(env, agent, seed=self.seed, computing_time=computing)
             car = env.unwrapped.vehicle  # type: ignore[attr-defined]
             env.close()
         measured = metrics.evaluate(driven.trace, driven.path, car)
         if bad := sorted(name for name, value in measured.items() if not np.isfinite(value)):
             raise ValueError(f"metrics not finite: {', '.join(bad)}")
-    except Exception as error:  # noqa: BLE001  a failed case must not end a sweep
-        return {
-            **result,
-            "status": "failed",
-            "error": f"{type(error).__name__}: {error}",
-            "metrics": {},
-            "solver": {},
-            "warnings": [],
-            "seconds": time.perf_counter() - began,
-            "trace": {},
+        noted = [str(warning.message) for warning in caught if warning.category is UserWarning]
+        result |= {
+            "end": driven.end,
+            "metrics": measured,
+            "solver": solver_summary(driven),
+            "warnings": sorted({*noted, *driven.path.metadata.get("warnings", [])}),
+            **({} if computing is None else {"latency": computing.summary()}),
+            "trace": driven.trace.as_dict(),
         }
-    noted = [str(warning.message) for warning in caught if warning.category is UserWarning]
-    return {
-        **result,
-        "end": driven.end,
-        "metrics": measured,
-        "solver": solver_summary(driven),
-        "warnings": sorted({*noted, *driven.path.metadata.get("warnings", [])}),
-        "seconds": time.perf_counter() - began,
-        **({} if computing is None else {"latency": computing.summary()}),
-        "trace": driven.trace.as_dict(),
-    }
+
+
+@cache
+def project_digest() -> str:
+    """Return the digest of all sources that a result depends on."""
+    packages = (trajectories, lpv_track_env, agents)
+    folders = [Path(str(package.__file__)).parent for package in packages]
+    here = Path(__file__).parent
+    names = ("case", "rollout", "metrics", "computing", "learning_cost", "traffic")
+    own = "".join((here / f"{name}.py").read_text() for name in names)
+    return hashlib.sha256((source_digest(*folders) + own).encode()).hexdigest()[:16]
+
+
+def run_case(spec: Mapping[str, Any], kind: type[BaseCase] = Case) -> dict[str, Any]:
+    """Run one case; what fails within the case becomes its result, not an exception.
+
+    Parameters
+    ----------
+    spec
+        Fields of the case.
+    kind
+        Class of the case.
+
+    Returns
+    -------
+    dict
+        `id`, the spec's fields, `status` ("ok" or "failed" with `error`), `seconds`, and the
+        entries of the case's `drive`.
+    """
+    case = kind(**spec)
+    result: dict[str, Any] = {"id": case.id, **case.as_dict(), "status": "ok", "end": None}
+    began = time.perf_counter()
+    try:
+        case.drive(result)
+    except Exception as error:  # noqa: BLE001  a failed case must not end a sweep
+        result |= case.failure(f"{type(error).__name__}: {error}")
+    return {**result, "seconds": time.perf_counter() - began}
+
+
+def worker_death(spec: Mapping[str, Any], kind: type[BaseCase] = Case) -> dict[str, Any]:
+    """Return the result of a case that killed its worker process twice."""
+    return kind(**spec).failure("the worker process died, twice")
 
 
 def solver_summary(driven: Rollout) -> dict[str, Any]:
-    """Times of `predict` (s) over an episode, and what its solves came to.
+    """Summarise the times of `predict` (s) and the solves of an episode.
 
     The first call, which may still compile or allocate, counts like every other.
     """

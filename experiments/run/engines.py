@@ -1,7 +1,8 @@
-"""Where cases run: in this process, or over a pool of local worker processes.
+"""Engines that run specs: in this process, or over a pool of local worker processes.
 
-A worker that dies takes its pool with it. The pool is rebuilt and the cases that were in flight are
+A worker that dies takes its pool with it. The pool is rebuilt and the specs that were in flight are
 run alone, one by one; one that kills its worker again is marked failed and the sweep goes on.
+Nothing here loads a numerical library, so `one_thread` can be called before they load.
 """
 
 import multiprocessing
@@ -12,18 +13,54 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait as wait_for
+from types import FrameType
 from typing import Any
-
-from experiments.run.case import Case, run_case
-from experiments.run.process import one_thread
 
 Result = dict[str, Any]
 Spec = Mapping[str, Any]
 Run = Callable[[Spec], Result]
 
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def one_thread() -> None:
+    """Give numerical libraries one thread, here and in child processes; call before they load."""
+    for variable in THREAD_VARIABLES:
+        os.environ.setdefault(variable, "1")
+
+
+class Interrupts:
+    """Context that remembers Ctrl-C, for code that may swallow the KeyboardInterrupt.
+
+    CasADi takes a Ctrl-C during a solve for a failed solve, and Python drops one that comes while
+    a destructor runs. KeyboardInterrupt is raised as usual, and `check` raises it again.
+    """
+
+    def __init__(self) -> None:
+        self._came = False
+        self._before: Any = None
+
+    def __enter__(self) -> "Interrupts":
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._remember)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _remember(self, _number: int, _frame: FrameType | None) -> None:
+        self._came = True
+        raise KeyboardInterrupt
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if Ctrl-C was pressed inside the context."""
+        if self._came:
+            raise KeyboardInterrupt
+
 
 def in_process(
-    specs: Sequence[Spec], run: Run = run_case, started: Callable[[Spec], None] | None = None
+    specs: Sequence[Spec], run: Run, started: Callable[[Spec], None] | None = None
 ) -> Iterator[Result]:
     """Run cases one after another here."""
     for spec in specs:
@@ -32,29 +69,12 @@ def in_process(
         yield run(spec)
 
 
-def worker_death(spec: Spec) -> Result:
-    """Result of a case that killed its worker twice."""
-    case = Case(**spec)
-    return {
-        "id": case.id,
-        **case.as_dict(),
-        "status": "failed",
-        "end": None,
-        "error": "the worker process died, twice",
-        "metrics": {},
-        "solver": {},
-        "warnings": [],
-        "seconds": 0.0,
-        "trace": {},
-    }
-
-
 def local_pool(
     specs: Sequence[Spec],
     workers: int,
-    run: Run = run_case,
+    run: Run,
+    died: Run,
     started: Callable[[Spec], None] | None = None,
-    died: Run = worker_death,
 ) -> Iterator[Result]:
     """Run cases over `workers` processes and yield results as they end.
 

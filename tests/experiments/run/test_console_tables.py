@@ -73,12 +73,12 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(
 ) -> None:
     specs = suites.grid(["stanley"], ["T2"], seeds=range(count))
 
-    def results(specs: list[dict[str, Any]], **_: Any) -> Iterator[dict[str, Any]]:
+    def results(specs: list[dict[str, Any]], *_: Any) -> Iterator[dict[str, Any]]:
         for number, spec in enumerate(specs):
             yield case(number, seed=spec["seed"])
 
     monkeypatch.setattr(benchmark.engines, "in_process", results)
-    monkeypatch.setattr(benchmark, "check", lambda _: None)
+    monkeypatch.setattr(benchmark.Case, "check", lambda _: None)
     monkeypatch.setattr(ResultStore, "append", lambda *_: None)
     console = Console(width=120, file=io.StringIO())
     benchmark.run_benchmark(specs, tmp_path, workers=1, settings={}, console=console)

@@ -9,7 +9,8 @@ import pytest
 pytest.importorskip("highway_env")
 
 from experiments.cli import main
-from experiments.highway.drives import TrafficDrive, run_drive
+from experiments.run.case import run_case
+from experiments.run.traffic import TrafficCase
 
 SMALL = ["--env", "time_limit=2.0", "--seeds", "2", "--workers", "1"]
 
@@ -49,20 +50,20 @@ def test_agents_and_highway_envs_own_beside_each_other(
 @pytest.mark.parametrize("agent", ["lpv-nmpc", "idm"])
 def test_a_drive_is_its_spec(agent: str) -> None:
     spec = {"agent": agent, "seed": 3, "env_settings": {"time_limit": 3.0, "other_vehicles": 5}}
-    once, again = run_drive(spec), run_drive(spec)
+    once, again = run_case(spec, TrafficCase), run_case(spec, TrafficCase)
     for one in (once, again):
         del one["seconds"]
         one["metrics"].pop("predict_median", None)
     assert once == again
     assert once["metrics"]["progress"] > 10.0
-    other = TrafficDrive(**{**spec, "seed": 4})
+    other = TrafficCase(**{**spec, "seed": 4})
     assert other.id != once["id"]
 
 
 def test_a_lap_of_highway_envs_own_ends_where_ours_does() -> None:
     settings = {"other_vehicles": 0}
     results = [
-        run_drive({"agent": agent, "scene": "racetrack-oval", "env_settings": settings})
+        run_case({"agent": agent, "scene": "racetrack-oval", "env_settings": settings}, TrafficCase)
         for agent in ("idm", "stanley")
     ]
     assert [one["end"] for one in results] == ["finished", "finished"]
@@ -92,7 +93,7 @@ def test_a_drive_that_breaks_down_is_a_failed_one(tmp_path: Path) -> None:
         "    def new_memory(self):\n        return None\n\n"
         "    def control(self, observation, memory):\n        raise RuntimeError('no idea')\n"
     )
-    result = run_drive({"agent": f"{file}:Broken"})
+    result = run_case({"agent": f"{file}:Broken"}, TrafficCase)
     assert result["status"] == "failed"
     assert result["error"] == "RuntimeError: no idea"
 

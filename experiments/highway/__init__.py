@@ -1,1 +1,0 @@
-"""`lpv-track highway`: agents in highway-env's traffic, beside its own controllers."""
