@@ -32,76 +32,80 @@ SURROUNDINGS: dict[str, dict[str, Any]] = {
 """Configurations of highway-env's observations, by their names here."""
 
 OPTIONS = tuple(option for option in RESET_OPTIONS if option != "trajectory")
+"""Reset options; highway-env draws the trajectory."""
 EXTRA_TIME = 30.0
+"""Default time limit beyond twice the path's duration, s."""
 
 
 class HighwayTrackEnv(PathTrackingEnv):
     """A vehicle (dynamic bicycle) follows a lane of highway-env's roads, among its traffic.
 
     Action, reward, starting errors, conditions, plants and info are those of
-    `lpv_track_env/PathTracking-v0` (`lpv_track_env.env.PathTrackingEnv`); what follows is what
-    differs.
+    `lpv_track_env/PathTracking-v0` (`lpv_track_env.env.PathTrackingEnv`); this text describes the
+    differences.
 
     ## Path
 
-    The route's lane on which highway-env starts the ego vehicle, refitted as one smooth curve
+    The lane of the route on which highway-env starts the ego vehicle, fitted by one smooth curve
     (`lpv_track_env.highway.routes`). The reference speed is the path's own jerk-limited profile,
-    lowered by adaptive cruise control to keep a gap to who is ahead
-    (`lpv_track_env.highway.cruise`): an agent sees that in the speeds of its preview. What the
-    cruise control knows of the traffic is one control period old.
+    lowered by adaptive cruise control to keep a gap to the vehicle ahead
+    (`lpv_track_env.highway.cruise`); an agent sees this in the speeds of its preview. The cruise
+    control uses positions of the traffic that are one control period old.
 
     ## Observation space
 
     `Dict(tracking=Box(8 + 2 K), surroundings=Box(...))`: the observation of path tracking
-    (`lpv_track_env.observation`), and what highway-env observes: by "lidar" (16, 2), distance and
-    speed of the nearest body in each sector of 22.5 degrees, in units of 60 m and 60 m/s; by
-    "kinematics" (5, 5), the rows of nearby vehicles. With `flat=True` both in one `Box`, tracking
-    first; with `surroundings=None` tracking alone. This project's agents take the tracking part.
+    (`lpv_track_env.observation`), and the one of highway-env. "lidar" is (16, 2): distance and
+    speed of the nearest body in each sector of 22.5 degrees, in units of 60 m and 60 m/s.
+    "kinematics" is (5, 5): one row for each nearby vehicle. With `flat=True` both parts are in one
+    `Box`, tracking first; with `surroundings=None` there is only the tracking part. This project's
+    agents use the tracking part.
 
     ## Episode end
 
-    As in path tracking, a lap (or `laps`) or the end of the route being `finished`, and
+    As in path tracking; `finished` means the end of the route, or of a lap (or of `laps`). And
 
     | end | when |
     |---|---|
-    | `collision` | the body touches another (terminated; the reward's `end` term counts it) |
+    | `collision` | the body touches another (terminated; the reward's `end` term applies) |
 
     ## Starting state
 
-    `reset(seed=s)` makes the very traffic that highway-env makes with seed s, and starts where its
-    ego vehicle would; further resets draw new ones. Options are those of path tracking, without
+    `reset(seed=s)` makes the same traffic as highway-env with seed s, and starts at the place of
+    its ego vehicle; further resets draw new traffic. Options are those of path tracking, without
     `trajectory`.
 
     ## Info
 
-    Beside path tracking's: `gap` (m to the bumper of who is ahead, inf if nobody is),
-    `leader_speed` (m/s along the path, nan if nobody is), `lane_error` (m, offset from the centre
-    of highway-env's own lane, positive to the path's left), `collision` (bool).
+    In addition to path tracking's: `gap` (m to the bumper of the vehicle ahead, inf if there is
+    none), `leader_speed` (m/s along the path, NaN if there is none), `lane_error` (m, offset from
+    the centre of highway-env's own lane, positive to the path's left), `collision` (bool).
 
     ## Arguments
 
     scene
-        A name (`lpv_track_env.highway.scenes.SCENES`), a `Scene`, or a `RoadNetwork` of the user's.
+        A name (`lpv_track_env.highway.scenes.SCENES`), a `Scene`, or the user's `RoadNetwork`.
     route
-        Names of the nodes to pass, if not the scene's own; a lap ends where it begins.
+        Names of the nodes to pass, in place of the scene's own; a lap ends where it begins.
     surroundings
         "lidar", "kinematics", a configuration of highway-env's observations, or None.
     flat
-        Whether the observation is one vector.
+        True for an observation in one vector.
     other_vehicles
-        Number of other vehicles in the scene's terms (`Scene.make`); None: highway-env's own.
+        Number of other vehicles, as the scene counts it (`Scene.make`); None for its default.
     cruise
-        Settings of the gap, or None: the path's own speed, whoever is ahead.
+        Settings of the gap; None keeps the path's own speed whoever is ahead.
     speed_limits
-        Of the reference, in place of 2 m/s^2 across, 1.5 m/s^2 along and the scene's speed.
+        Limits of the reference; by default 2 m/s^2 laterally, 1.5 m/s^2 longitudinally and the
+        scene's speed.
     laps
-        Of a closed route, until the episode is finished.
+        Number of laps of a closed route until the episode is finished.
 
     vehicle
-        As in `PathTrackingEnv`; the least of its speed range becomes 0, for it may have to stop.
+        As in `PathTrackingEnv`; its lowest speed becomes 0, because it may have to stop.
 
-    The others are those of `PathTrackingEnv`; `time_limit` is by default twice the path's duration
-    and 30 s more.
+    The other arguments are those of `PathTrackingEnv`; `time_limit` is by default twice the path's
+    duration plus 30 s.
 
     ## Version history
 

@@ -162,8 +162,8 @@ def leaders(
     A body will block the path if it moves into it sideways at its present lateral speed within the
     time of a cut-in, or if its own lane leads into it, as at a merge or a roundabout. In the second
     case its place is projected back: the arc length that it will reach on the path, minus the
-    distance that it covers until then. So of two vehicles that approach a merge from the same
-    distance, one yields.
+    distance that it covers until then. So of two vehicles that approach a merge, the one that would
+    arrive later yields.
 
     Parameters
     ----------
