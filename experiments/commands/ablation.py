@@ -188,7 +188,7 @@ def draw(result: Mapping[str, Any], file: Path) -> None:
     ax.invert_yaxis()
     ax.set_xscale("log")
     plain_ticks(ax.xaxis)
-    ax.set_xlabel("ALE, m (hatched: some episodes left the road, so it says little)")
+    ax.set_xlabel("ALE, m (hatched: some episodes left the road)")
     ax.grid(visible=True, axis="x", alpha=0.3)
     ax.legend(loc="upper right")
     ax.set_title(f"{result['agent']}: each disturbance alone, and all of them")

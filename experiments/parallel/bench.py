@@ -67,15 +67,15 @@ WAYS: dict[str, Wait] = {
 
 
 def read(
-    link: Link, reader: Reader, condition: Any, way: str, values: int, said: Connection
+    link: Link, reader: Reader, condition: Any, way: str, values: int, sent: Connection
 ) -> None:
     """Take the values and send back their latencies, s."""
     wait = WAYS[way]
     latencies: list[float] = []
     reader.open()
-    link.say(READY)
+    link.report(READY)
     quiet()
-    while reader.taken < values + WARM_UP:  # A value that was overwritten is skipped.
+    while reader.last_read < values + WARM_UP:  # A value that was overwritten is skipped.
         message = wait(reader, condition)
         now = time.monotonic_ns()
         if message is None:
@@ -83,7 +83,7 @@ def read(
         if message.sequence > WARM_UP:
             latencies.append(1e-9 * (now - message.stamp))
     reader.close()
-    said.send_bytes(np.array(latencies).tobytes())
+    sent.send_bytes(np.array(latencies).tobytes())
 
 
 def measure(way: str, values: int) -> NDArray[np.float64]:
@@ -94,14 +94,14 @@ def measure(way: str, values: int) -> NDArray[np.float64]:
     context = multiprocessing.get_context("spawn")
     mailbox = Mailbox(ESTIMATE)
     condition = context.Condition()
-    heard, said = context.Pipe(duplex=False)
+    received, sent = context.Pipe(duplex=False)
     writer = mailbox.writer.open()
-    child = Child("reader", context, read, (mailbox.reader, condition, way, values, said))
-    said.close()
+    child = Child("reader", context, read, (mailbox.reader, condition, way, values, sent))
+    sent.close()
     try:
-        while not child.heard(READY):
+        while not child.reported(READY):
             if child.dead:
-                raise RuntimeError(f"the reader {child.cause_of_death()}")
+                raise RuntimeError(f"the reader {child.how_it_ended()}")
             time.sleep(PAUSE)
         mailbox.unlink()
         record = np.zeros((), ESTIMATE)
@@ -111,10 +111,10 @@ def measure(way: str, values: int) -> NDArray[np.float64]:
             if WAYS[way] is by_condition:
                 with condition:
                     condition.notify_all()
-        return np.frombuffer(heard.recv_bytes())
+        return np.frombuffer(received.recv_bytes())
     except EOFError:
         child.process.join()
-        raise RuntimeError(f"the reader {child.cause_of_death()}") from None
+        raise RuntimeError(f"the reader {child.how_it_ended()}") from None
     finally:
         child.end()
         mailbox.close()

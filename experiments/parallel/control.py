@@ -42,9 +42,9 @@ def control(link: Link, setup: Setup, estimates: Reader, commands: Writer) -> No
         When the agent has failed ten times in a row; each failure before that brakes.
     """
     with estimates, commands:
-        link.say(ATTACHED)
+        link.report(ATTACHED)
         controller = prepared(setup)
-        link.say(READY)
+        link.report(READY)
         quiet()
         while not link.stopped():
             message = estimates.wait(controller.patience(time.monotonic_ns()))
@@ -97,22 +97,22 @@ class Controller:
         self._speed = 0.0
         self._place = (math.inf, math.inf)
         self.command: NDArray[Any] = np.zeros((), COMMAND)
-        """Last command; its `taken` is 0 before the first."""
+        """Last command; its `due` is 0 before the first."""
 
     def is_stale(self, now: int) -> bool:
         """Return whether the newest estimate is three control periods old at time `now` (ns)."""
-        taken = int(self.command["taken"])
-        return taken > 0 and now - taken >= self._stale_after
+        due = int(self.command["due"])
+        return due > 0 and now - due >= self._stale_after
 
     def patience(self, now: int) -> float:
         """Return the time to wait for an estimate, s: until the newest is stale, then a period."""
-        left = 1e-9 * (int(self.command["taken"]) + self._stale_after - now)
+        left = 1e-9 * (int(self.command["due"]) + self._stale_after - now)
         return min(left, self._period) if left > 0.0 else self._period
 
     def answer(self, estimate: Any, estimated: int) -> None:
         """Set the command for an ESTIMATE record that was written at time `estimated` (ns)."""
         command = self.command
-        command["period"], command["taken"] = estimate["period"], estimate["taken"]
+        command["period"], command["due"] = estimate["period"], estimate["due"]
         command["estimated"] = estimated
         command["solve_time"] = 0.0
         state, steering_angle = estimate["state"], float(estimate["steering_angle"])

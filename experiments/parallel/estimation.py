@@ -99,12 +99,12 @@ FILTERS: dict[str, Callable[[Setup], Filter]] = {"ekf": Ekf, "truth": Truth}
 def estimate(link: Link, setup: Setup, samples: Reader, estimates: Writer) -> None:
     """Send an estimate each control period until the supervisor stops the process."""
     with samples, estimates:
-        link.say(ATTACHED)
+        link.report(ATTACHED)
         make = FILTERS[setup.estimator]
         record = np.zeros((), ESTIMATE)
         warm_up(make(setup), record)
         chosen = make(setup)
-        link.say(READY)
+        link.report(READY)
         quiet()
         serve(link, chosen, samples, estimates, record)
 
@@ -121,7 +121,7 @@ def serve(link: Link, chosen: Filter, samples: Reader, estimates: Writer, record
         if last == 0 or sample["period"] == published:
             continue
         published = int(sample["period"])
-        for name in ("period", "taken", "time", "acceleration", "steering_angle"):
+        for name in ("period", "due", "time", "acceleration", "steering_angle"):
             record[name] = sample[name]
         record["samples_lost"] = lost
         chosen.write(record)

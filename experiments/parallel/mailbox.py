@@ -96,7 +96,7 @@ class Mailbox:
         self.reader = Reader(name, dtype, slots, waiting)
         """The only reader that can wait."""
 
-    def watcher(self) -> "Reader":
+    def passive_reader(self) -> "Reader":
         """Return a further reader, which can read but not wait."""
         return Reader(self._memory.name, self.dtype, self.slots, None)
 
@@ -193,7 +193,7 @@ class Reader(_End):
         self, name: str, dtype: np.dtype[Any], slots: int, connection: Connection | None
     ) -> None:
         super().__init__(name, dtype, slots, connection)
-        self.taken = 0
+        self.last_read = 0
         """Sequence number of the newest value that was returned."""
         self.writer_gone = False
         """True once a wait has found that no process has the writing end open."""
@@ -221,7 +221,7 @@ class Reader(_End):
             return None
         message = self.latest()
         assert message is not None
-        self.taken = message.sequence
+        self.last_read = message.sequence
         return message
 
     def wait_all(self, timeout: float) -> list[Message]:
@@ -232,20 +232,20 @@ class Reader(_End):
         if not self._wait(timeout):
             return []
         newest = int(self._front[0])
-        first = max(self.taken + 1, newest - self._slots + 1)
+        first = max(self.last_read + 1, newest - self._slots + 1)
         copies = [self._copy(sequence) for sequence in range(first, newest + 1)]
         messages = [message for message in copies if message is not None]
         if not messages:  # All were overwritten while they were copied.
             message = self.latest()
             assert message is not None
             messages = [message]
-        self.taken = messages[-1].sequence
+        self.last_read = messages[-1].sequence
         return messages
 
     def _wait(self, timeout: float) -> bool:
         """Wait up to `timeout` s for an unread value; return whether there is one."""
         deadline = time.monotonic() + timeout
-        while self._front[0] <= self.taken:
+        while self._front[0] <= self.last_read:
             left = deadline - time.monotonic()
             if left <= 0.0:
                 return False

@@ -31,7 +31,7 @@ class Link:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
 
-    def say(self, word: str, detail: str = "") -> None:
+    def report(self, word: str, detail: str = "") -> None:
         """Send a word to the supervisor; no effect if it is gone."""
         with suppress(OSError):
             self._connection.send((word, detail))
@@ -54,7 +54,7 @@ def child_main(role: Role, connection: Connection, parent: int, arguments: tuple
     try:
         role(link, *arguments)
     except Exception as error:  # noqa: BLE001  reported to the supervisor, which ends the run
-        link.say(FAILED, f"{type(error).__name__}: {' '.join(str(error).split())}")
+        link.report(FAILED, f"{type(error).__name__}: {' '.join(str(error).split())}")
         sys.exit(1)
 
 
@@ -107,36 +107,36 @@ class Child:
         self.process: SpawnProcess = context.Process(
             target=child_main, args=(role, theirs, os.getpid(), arguments), name=name, daemon=True
         )
-        self._heard: dict[str, str] = {}
+        self._reports: dict[str, str] = {}
         self.process.start()
         theirs.close()
 
-    def heard(self, word: str) -> bool:
+    def reported(self, word: str) -> bool:
         """Return whether the child has sent a word."""
         self._listen()
-        return word in self._heard
+        return word in self._reports
 
     def _listen(self) -> None:
         with suppress(EOFError, OSError):
             while self._connection.poll():
                 word, detail = self._connection.recv()
-                self._heard[word] = detail
+                self._reports[word] = detail
 
     @property
     def dead(self) -> bool:
         """True once the process has ended."""
         return self.process.exitcode is not None
 
-    def cause_of_death(self) -> str:
+    def how_it_ended(self) -> str:
         """Return how a dead child ended, in words."""
         code = self.process.exitcode
-        if self.heard(FAILED):
-            return f"failed: {self._heard[FAILED]}"
+        if self.reported(FAILED):
+            return f"failed: {self._reports[FAILED]}"
         if code is not None and code < 0:
             return f"was killed by {signal.Signals(-code).name}"
         return f"ended with exit code {code}"
 
-    def ask_to_stop(self) -> None:
+    def request_stop(self) -> None:
         """Tell the child to end."""
         self._listen()
         self._connection.close()
@@ -144,7 +144,7 @@ class Child:
     def end(self) -> None:
         """Ask the child to stop and wait for it; terminate or kill it if it does not."""
         if not self._connection.closed:
-            self.ask_to_stop()
+            self.request_stop()
         for make_end in (self.process.terminate, self.process.kill):
             self.process.join(GRACE)
             if self.dead:

@@ -1,8 +1,8 @@
 """Settings of a parallel run and the messages between its processes.
 
-Messages are numpy records in SI units; NaN stands for a quantity that was not measured. Times named
-`taken` are in ns of `time.monotonic_ns()`, a clock that all processes share: the instant at which
-the sample behind a message was due.
+Messages are numpy records in SI units; NaN stands for a quantity that was not measured. `due` is
+the instant at which the sample behind a message was due, ns of `time.monotonic_ns()`, a clock that
+all processes share.
 """
 
 import math
@@ -34,7 +34,7 @@ ESTIMATORS = ("ekf", "truth")
 SAMPLE = np.dtype(
     [
         ("period", np.int64),  # number of its control period, from 0
-        ("taken", np.int64),
+        ("due", np.int64),
         ("time", np.float64),  # s on the vehicle's clock
         ("mean_acceleration", np.float64),  # reported by the actuators, mean since the last
         ("mean_steering_angle", np.float64),  # sample: m/s^2, rad
@@ -54,7 +54,7 @@ SAMPLE = np.dtype(
 ESTIMATE = np.dtype(
     [
         ("period", np.int64),
-        ("taken", np.int64),  # of the newest sample in it
+        ("due", np.int64),  # of the newest sample in it
         ("time", np.float64),
         ("state", np.float64, (6,)),  # [vx, vy, psi, r, X, Y]
         ("acceleration", np.float64),  # in force at that time
@@ -73,7 +73,7 @@ ESTIMATE = np.dtype(
 COMMAND = np.dtype(
     [
         ("period", np.int64),
-        ("taken", np.int64),  # of the estimate that it answers
+        ("due", np.int64),  # of the estimate that it answers
         ("estimated", np.int64),  # when that estimate was written
         ("acceleration", np.float64),  # m/s^2
         ("steering_angle", np.float64),  # rad

@@ -75,7 +75,7 @@ class Supervisor:
         self._recording = Recording()
         self._children: list[Child] = []
         self._mailboxes: list[Mailbox] = []
-        self._watchers: list[Reader] = []
+        self._readers: list[Reader] = []
         self._fault = ""
         self._origin = 0
         self._sample = np.zeros((), SAMPLE)
@@ -92,8 +92,8 @@ class Supervisor:
         samples, estimates, commands = self._mailboxes
         self._samples = samples.writer.open()
         self._commands = commands.reader.open()
-        self._estimates = estimates.watcher().open()
-        self._watchers.append(self._estimates)
+        self._estimates = estimates.passive_reader().open()
+        self._readers.append(self._estimates)
         for name, role, ends in (
             ("estimator", estimate, (samples.reader, estimates.writer)),
             ("controller", control, (estimates.reader, commands.writer)),
@@ -112,14 +112,14 @@ class Supervisor:
     def _all_report(self, word: str) -> bool:
         """Wait for a word from both children; return False on a fault or a signal."""
 
-        def heard_or_dead() -> bool:
-            return all(child.heard(word) for child in self._children) or any(
+        def reported_or_dead() -> bool:
+            return all(child.reported(word) for child in self._children) or any(
                 child.dead for child in self._children
             )
 
         if self._fault or self._stop.number:
             return False
-        if not wait_until(heard_or_dead, START_TIMEOUT, self._stop):
+        if not wait_until(reported_or_dead, START_TIMEOUT, self._stop):
             if not self._stop.number:
                 self._fault = f"the processes were not {word} after {START_TIMEOUT:g} s"
             return False
@@ -136,7 +136,7 @@ class Supervisor:
             finally:
                 no_longer_quiet()
         for child in self._children:
-            child.ask_to_stop()
+            child.request_stop()
         stopped = self._vehicle.stop()
         if self._stop.number:
             end = signal.Signals(self._stop.number).name
@@ -195,10 +195,10 @@ class Supervisor:
         value = message.value
         now = time.monotonic_ns()
         self._vehicle.advance(min(1e-9 * (now - self._origin), tick_ms / MS_PER_SECOND))
-        taken = int(value["taken"])
+        due = int(value["due"])
         accepted = self._vehicle.take(
             float(value["acceleration"]), float(value["steering_angle"]),
-            1e-9 * (taken - self._origin),
+            1e-9 * (due - self._origin),
         )  # fmt: skip
         if accepted:
             self._answered = int(value["period"])
@@ -206,8 +206,8 @@ class Supervisor:
             applied = max(self._origin + round(1e9 * self._vehicle.time), now)
             self._recording.commands.append(
                 (
-                    int(value["period"]), 1e-9 * (applied - taken),
-                    1e-9 * (int(value["estimated"]) - taken), 1e-9 * (message.stamp - taken),
+                    int(value["period"]), 1e-9 * (applied - due),
+                    1e-9 * (int(value["estimated"]) - due), 1e-9 * (message.stamp - due),
                     float(value["solve_time"]), int(value["reason"]), int(value["failures"]),
                 )
             )  # fmt: skip
@@ -215,7 +215,7 @@ class Supervisor:
     def _publish(self, ms: int, due: int) -> None:
         sample, vehicle = self._sample, self._vehicle
         sample["period"] = ms // self.setup.period_ms
-        sample["taken"], sample["time"] = due, ms / MS_PER_SECOND
+        sample["due"], sample["time"] = due, ms / MS_PER_SECOND
         sample["mean_acceleration"], sample["mean_steering_angle"] = vehicle.mean_inputs()
         sample["acceleration"], sample["steering_angle"] = vehicle.in_force
         state = vehicle.info["state"]
@@ -233,7 +233,7 @@ class Supervisor:
     def _check_for_dead(self) -> None:
         for child in self._children:
             if not self._fault and child.dead:
-                self._fault = f"the {child.name} {child.cause_of_death()}"
+                self._fault = f"the {child.name} {child.how_it_ended()}"
 
     def _check_for_hung(self) -> None:
         """Set the fault if a process has left samples unanswered for too long.
@@ -262,7 +262,7 @@ class Supervisor:
         """End both processes and remove the mailboxes, whatever their state."""
         for child in self._children:
             child.end()
-        for watcher in self._watchers:
-            watcher.close()
+        for reader in self._readers:
+            reader.close()
         for mailbox in self._mailboxes:
             mailbox.close()

@@ -18,7 +18,7 @@ KEY_FIGURES = (
 """Headings of `key_lines`."""
 BAND_NOTE = (
     "ALE (m) where the path's |curvature| at the foot point is in the band: mean over seeds of the "
-    "mean over a seed's drives, ± 95 % interval by the t-distribution over seeds, because drives of "
+    "mean over a seed's drives, ± 95 % interval by the t-distribution over seeds, since drives of "
     "one seed share their disturbances whatever the path. Below it, the number of drives that "
     "reached the band and its share of the agent's driving time; an agent that leaves the road "
     "early covers less of the path. The largest lateral and the rms heading error by band are in "

@@ -1,4 +1,4 @@
-"""A headless Chromium to look at pages with."""
+"""A headless Chromium for tests of pages."""
 
 import base64
 import shutil
@@ -16,12 +16,12 @@ FLAGS = (
     "--disable-dev-shm-usage",
 )  # fmt: skip
 PHONE, DESK = 360, 1400
-"""px, widths of the narrowest screen that pages are made for, and of a usual one."""
+"""Widths of the narrowest supported screen and of a usual one, px."""
 
 
 @contextmanager
 def chromium(profile: Path) -> Iterator[webdriver.Chrome]:
-    """A browser with an empty profile; skips the test where there is none.
+    """Start a browser with an empty profile; skip the test if none is installed.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def chromium(profile: Path) -> Iterator[webdriver.Chrome]:
 
 
 def show(browser: webdriver.Chrome, page: Path, width: int = DESK) -> None:
-    """Open a page at a width in px, as a phone below 500."""
+    """Open a page at a width in px; below 500 emulate a phone."""
     browser.execute_cdp_cmd(
         "Emulation.setDeviceMetricsOverride",
         {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500},
@@ -54,12 +54,12 @@ def show(browser: webdriver.Chrome, page: Path, width: int = DESK) -> None:
 
 
 def prefer(browser: webdriver.Chrome, **features: str) -> None:
-    """Pretend that the user prefers something, such as prefers-color-scheme dark."""
+    """Emulate preferences of the user, such as prefers_color_scheme="dark"."""
     given = [{"name": name.replace("_", "-"), "value": value} for name, value in features.items()]
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": given})
 
 
 def pixels(browser: webdriver.Chrome, canvas: str) -> bytes:
-    """A canvas' picture, PNG."""
+    """Return the content of a canvas as PNG."""
     script = "return document.querySelector(arguments[0]).toDataURL()"
     return base64.b64decode(browser.execute_script(script, canvas).split(",", 1)[1])

@@ -1,4 +1,4 @@
-"""Agents with faults, for tests: given as faulty_agents.py:Class."""
+"""Faulty agents for tests, named faulty_agents.py:Class."""
 
 import time
 
@@ -8,7 +8,7 @@ from experiments.parallel.control import WARM_UP
 
 
 class Hangs:
-    """Goes straight on, and after some periods never answers again."""
+    """Drives straight on, and hangs after some periods."""
 
     def __init__(self, task) -> None:
         self.rolling = task.vehicle.rolling_deceleration

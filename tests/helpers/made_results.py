@@ -1,4 +1,4 @@
-"""Results made by hand, folders of them, and what their report and table say."""
+"""Hand-made results, result folders, and the report and table of them."""
 
 from html.parser import HTMLParser
 
@@ -33,7 +33,7 @@ def case(number, agent="stanley", trajectory="T2", metrics=(), solver=(), **more
 
 
 def trace(n=1200, seed=0, noise=0.0, slip=0.05):
-    """A drive along X that weaves, with noise on everything if asked for."""
+    """Return the trace of a drive that weaves along X, with noise if wanted."""
     rng = np.random.default_rng(seed)
     time = 0.05 * np.arange(n)
     rough = noise * rng.normal(size=(4, n))
@@ -63,9 +63,9 @@ def page(folder):
 
 
 def own_scripts_alone(text):
-    """Whether all scripts of a page are its own: the files beside the code, and one block of data.
+    """Return whether a page has no scripts but its own files and one block of data.
 
-    Parsed as browsers do, strictly: whatever is not valid HTML raises.
+    The parser is strict: it raises for invalid HTML.
     """
     parser = html5lib.HTMLParser(strict=True, namespaceHTMLElements=False)
     scripts = list(parser.parse(text).iter("script"))

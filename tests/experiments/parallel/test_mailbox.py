@@ -97,7 +97,7 @@ def test_wait_all_has_those_in_between_and_numbers_tell_what_is_lost(mailbox: Ma
 
 
 def test_a_watcher_looks_and_waits_without_a_pipe(mailbox: Mailbox) -> None:
-    watcher = mailbox.watcher().open()
+    watcher = mailbox.passive_reader().open()
     assert watcher.wait(0.01) is None
     mailbox.writer.put(record(7))
     message = watcher.wait(0.0)
@@ -226,7 +226,7 @@ def test_the_name_is_gone_while_both_sides_go_on() -> None:
     process.join(30.0)
     assert process.exitcode == 0
     with pytest.raises(FileNotFoundError):
-        mailbox.watcher().open()
+        mailbox.passive_reader().open()
     mailbox.close()
     mailbox.close()  # Once more does no harm.
 

@@ -201,7 +201,7 @@ def test_children_end_with_a_killed_supervisor(tmp_path: Path) -> None:
 
 
 def fails(link: Link) -> None:
-    link.say("attached")
+    link.report("attached")
     raise OSError("no such\nthing")
 
 
@@ -210,8 +210,8 @@ def test_a_child_tells_what_it_failed_of() -> None:
     child = Child("estimator", context, fails, ())
     child.process.join(30.0)
     assert child.dead
-    assert child.heard("attached")
-    assert child.cause_of_death() == "failed: OSError: no such thing"
+    assert child.reported("attached")
+    assert child.how_it_ended() == "failed: OSError: no such thing"
     child.end()
 
 
@@ -305,7 +305,7 @@ def controller() -> control.Controller:
 def an_estimate(controller: control.Controller, age: float = 0.001) -> np.ndarray:
     path = controller._observer.path
     record = np.zeros((), ESTIMATE)
-    record["taken"] = time.monotonic_ns() - int(1e9 * age)
+    record["due"] = time.monotonic_ns() - int(1e9 * age)
     record["state"] = [5.0, 0.0, path.heading[0], 0.0, path.x[0], path.y[0]]
     record["steering_angle"] = 0.02
     return record
@@ -319,7 +319,7 @@ def test_the_controller_drives_on_a_fresh_estimate(controller: control.Controlle
     controller.answer(estimate, 5)
     command = controller.command
     assert command["period"] == 7
-    assert command["taken"] == estimate["taken"]
+    assert command["due"] == estimate["due"]
     assert command["estimated"] == 5
     assert command["reason"] == DRIVING
     assert float(command["acceleration"]) == 0.5
@@ -329,7 +329,7 @@ def test_the_controller_drives_on_a_fresh_estimate(controller: control.Controlle
 
 @pytest.mark.parametrize(
     ("reason", "name", "value"),
-    [(NO_FIX, "fix_age", 2.5), (NOT_FINITE, "state", math.nan), (STALE_ESTIMATE, "taken", 1)],
+    [(NO_FIX, "fix_age", 2.5), (NOT_FINITE, "state", math.nan), (STALE_ESTIMATE, "due", 1)],
 )
 def test_the_controller_brakes_on_an_estimate_it_cannot_trust(
     controller: control.Controller, reason: int, name: str, value: float
@@ -370,7 +370,7 @@ def test_the_controller_brakes_by_itself_when_no_estimate_comes(
     now = time.monotonic_ns()
     assert controller.patience(now) == pytest.approx(0.02)
     estimate = an_estimate(controller)
-    estimate["taken"] = now
+    estimate["due"] = now
     controller.answer(estimate, now)
     assert controller.patience(now) == pytest.approx(0.02)
     assert controller.patience(now + 50_000_000) == pytest.approx(0.01)
@@ -380,7 +380,7 @@ def test_the_controller_brakes_by_itself_when_no_estimate_comes(
     for _ in range(400):
         controller.brake_on_stale()
         assert controller.command["reason"] == STALE_ESTIMATE
-        assert controller.command["taken"] == now
+        assert controller.command["due"] == now
         accelerations.append(float(controller.command["acceleration"]))
     assert accelerations[0] == pytest.approx(BUS.rolling_deceleration - 2.0)
     # Over 8 s it has braked to a stand, by its own account.
