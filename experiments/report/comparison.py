@@ -1,7 +1,6 @@
 """Sections that compare agents: with the published table, and by the path's curvature."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 from experiments.report.charts import BOTTOM, TOP, Chart, Scale, decades
 from experiments.report.computing import TRAINED_NOTE
@@ -54,16 +53,6 @@ def comparison_section(document: Document, cases: Sequence[Result], rows: Sequen
     return joined(parts)
 
 
-@dataclass(frozen=True)
-class Measured:
-    """An estimate of one agent on one trajectory under one kind of conditions."""
-
-    trajectory: str
-    label: str
-    conditions: str
-    value: Estimate
-
-
 def _agent_figures(document: Document, cases: Sequence[Result], rows: Sequence[Row]) -> list[str]:
     done = [case for case in cases if case.get("status") == "ok"]
     if not done:
@@ -77,66 +66,70 @@ def _agent_figures(document: Document, cases: Sequence[Result], rows: Sequence[R
     styles = condition_styles(list(dict.fromkeys(conditions.values())))
     parts = []
     for key, axis, name in ERRORS:
-        measured = [
-            Measured(row.trajectory, row.label, conditions[row.setting], row.values[key])
+        ours = [
+            row
             for row in rows
             if row.setting in conditions and not row.published and key in row.values
         ]
-        if measured:
+        if ours:
             parts.append(
                 document.figure(
                     f"{name} of every agent, {family}. Means, with 95 % intervals where there are "
                     "several seeds. Dashed: the published values of the same kind; the errata "
                     "explain how the two differ.",
-                    by_agent(measured, styles, axis, key),
+                    by_agent(ours, conditions, styles, axis, key),
                     legend(styles, styles),
                 )
             )
     return parts
 
 
-def by_agent(measured: Sequence[Measured], styles: Styles, words: str, key: str) -> list[Panel]:
+def by_agent(
+    rows: Sequence[Row], conditions: Mapping[Setting, str], styles: Styles, words: str, key: str
+) -> list[Panel]:
     """Return a panel per trajectory, a line per agent, a mark with interval per conditions.
 
     Parameters
     ----------
-    measured
-        Estimates, m or rad.
+    rows
+        Agents' rows with a value of `key`.
+    conditions
+        Conditions of each setting in words.
     styles
         Styles of the conditions, in their order.
     words
         Label of the axis.
     key
-        Column of the published table whose value is drawn as a line across the panel.
+        Column to draw, m or rad; its published value is a line across the panel.
     """
     panels = []
-    for name in dict.fromkeys(one.trajectory for one in measured):
-        group = [one for one in measured if one.trajectory == name]
-        labels = list(dict.fromkeys(one.label for one in group))
+    for name in dict.fromkeys(row.trajectory for row in rows):
+        group = [row for row in rows if row.trajectory == name]
+        labels = list(dict.fromkeys(row.label for row in group))
         names = [_shortened(label) for label in labels]
-        shown = list(dict.fromkeys(one.conditions for one in group))
+        shown = list(dict.fromkeys(conditions[row.setting] for row in group))
         references = {
-            conditions: row[key]
-            for conditions in shown
-            if (row := published.row(name, conditions)) is not None
+            kind: reference[key]
+            for kind in shown
+            if (reference := published.row(name, kind)) is not None
         }
-        values = [end for one in group for end in _ends(one.value)]
+        values = [end for row in group for end in _ends(row.values[key])]
         chart = Chart(
             decades([[*values, *references.values()]], FLOOR),
             Scale(len(labels) - 0.4, -0.6),
             x_label=words, y_names=names, left=12.0 + CHARACTER * max(map(len, names)),
             height=TOP + BOTTOM + 16.0 * len(labels),
         )  # fmt: skip
-        for conditions, value in references.items():
-            chart.rule(x=value, kind=f"c{styles[conditions].colour} d1")
-        for one in group:
-            place = labels.index(one.label) + 0.16 * (2 * shown.index(one.conditions) + 1)
-            place -= 0.16 * len(shown)
-            style = styles[one.conditions]
-            low, high = (max(end, FLOOR) for end in _ends(one.value))
+        for kind, value in references.items():
+            chart.rule(x=value, kind=f"c{styles[kind].colour} d1")
+        for row in group:
+            kind = conditions[row.setting]
+            place = labels.index(row.label) + 0.16 * (2 * shown.index(kind) + 1 - len(shown))
+            colour = styles[kind].colour
+            low, high = (max(end, FLOOR) for end in _ends(row.values[key]))
             if high > low:
-                chart.segment((low, high), (place, place), f"c{style.colour} mark")
-            chart.dot(max(one.value.mean, FLOOR), place, f"f{style.colour}")
+                chart.segment((low, high), (place, place), f"c{colour} mark")
+            chart.dot(max(row.values[key].mean, FLOOR), place, f"f{colour}")
         panels.append(Panel(name, chart.svg()))
     return panels
 
