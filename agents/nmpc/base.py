@@ -1,9 +1,8 @@
-"""What every NMPC agent has, whatever solves its problem: settings, weights, failure ladder."""
+"""Common base of the NMPC agents: settings, weights, fallback after failed solves."""
 
 from abc import ABC
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,79 +12,78 @@ from agents.base import DrivingTask, TrackingAgent
 from agents.classical.geometric import Stanley
 from agents.nmpc.problem import NmpcProblem
 from agents.nmpc.schedule import Switching
+from agents.nmpc.settings import NmpcSettings
 from agents.reference import local_reference
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import TrackingObservation
-from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]
 Memory = TypeVar("Memory")
 
 
 @dataclass
-class Ladder:
-    """What is remembered of one vehicle for when solves fail."""
+class Fallback:
+    """Memory of one vehicle's fallback, which replaces failed solves."""
 
     stanley: Any
-    """Memory of the fallback controller."""
-    fallback: str = ""
-    """What replaced a failed solve in the last step: "", "plan", "stanley" or "stop"."""
+    """Memory of Stanley's controller."""
+    used: str = ""
+    """Replacement in the last step: "plan", "stanley" or "stop", "" if the solve succeeded."""
     counts: Counter[str] = field(default_factory=Counter)
-    """Failed solves by status, and fallbacks by name, in this episode."""
+    """Failed solves by status, and replacements by name, in this episode."""
 
 
 class NmpcAgent(TrackingAgent[Memory], ABC):
-    """Settings that the NMPC agents share; see `RtiNmpc` for their meaning."""
+    """Base of the NMPC agents.
 
-    def __init__(
-        self,
-        task: DrivingTask,
-        *,
-        horizon: int | None,
-        weights: TrackingWeights | WeightSchedule | str | Path | None,
-        selection: str,
-        model: VehicleParameters | None,
-        linear_penalty: tuple[float, float, float],
-        quadratic_penalty: tuple[float, float, float],
-        max_failures: int,
-    ) -> None:
+    A failed solve is replaced by, in this order: the last plan's next input; once that plan is used
+    up, Stanley's controller on the same observation; after `max_failures` failures in a row,
+    braking with Stanley's steering. `diagnostics` names the replacement.
+
+    Parameters
+    ----------
+    task
+        Task of the agent.
+    settings
+        Settings of the agent.
+
+    Raises
+    ------
+    ValueError
+        If the horizon is longer than the preview, or a setting is out of range.
+    """
+
+    def __init__(self, task: DrivingTask, settings: NmpcSettings) -> None:
         super().__init__(task)
         steps = task.layout.preview_steps
-        horizon = steps if horizon is None else horizon
+        horizon = steps if settings.horizon is None else settings.horizon
         if horizon > steps:
             raise ValueError(
                 f"horizon {horizon} is longer than the preview of {steps} steps: "
                 f"make the environment with preview_steps={horizon}"
             )
-        if selection not in {"band", "path"}:
-            raise ValueError(f"selection must be 'band' or 'path', not {selection!r}")
         self.problem = NmpcProblem(
-            vehicle=model or task.vehicle,
+            vehicle=settings.model or task.vehicle,
             horizon=horizon,
             period=task.layout.preview_period,
             first_period=task.control_period,
-            linear_penalty=linear_penalty,
-            quadratic_penalty=quadratic_penalty,
+            linear_penalty=settings.linear_penalty,
+            quadratic_penalty=settings.quadratic_penalty,
         )
-        self.max_failures = max_failures
-        self._fallback = Stanley(task)
+        self.max_failures = settings.max_failures
+        self._stanley = Stanley(task)
         self.rejected_weights = 0
-        if isinstance(weights, str | Path):
-            weights = WeightSchedule.read(Path(weights))
-        if not isinstance(weights, TrackingWeights | WeightSchedule | None):
-            raise ValueError(  # noqa: TRY004  a setting, as every other
-                f"weights must be weights, a schedule or its file, not {type(weights).__name__}"
-            )
-        if isinstance(weights, WeightSchedule) and selection == "path":
+        weights: Any = settings.weights
+        if isinstance(weights, WeightSchedule) and settings.selection == "path":
             weights = weights.for_path(task.path)
-        self.switching = Switching(weights or TrackingWeights(), task.control_period)
+        self.switching = Switching(weights, task.control_period)
 
     def set_weights(self, weights: TrackingWeights | ArrayLike) -> bool:
-        """Take new weights, (10,) as Q, S, R, from the next step on; the warm start is kept.
+        """Set weights, (10,) as Q, S, R, from the next step on; the warm start is kept.
 
-        A schedule is followed no longer then. Values out of bounds are clipped to them; a vector
-        that is not finite, negative or of the wrong size is refused: the weights stay,
-        `rejected_weights` counts it, False is returned.
+        They replace a schedule, too. Values out of bounds are clipped. A vector that is not finite,
+        negative or of the wrong size is rejected: the weights stay as they are, `rejected_weights`
+        counts it, and False is returned.
         """
         try:
             values = (
@@ -101,22 +99,22 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
 
     @property
     def has_schedule(self) -> bool:
-        """Whether weights are chosen by curvature at every step."""
+        """True if curvature chooses the weights at every step."""
         sets: int = self.switching.tables.shape[1]
         return sets > 1
 
     @property
     def fixed_weights(self) -> Array:
-        """Q, S, R in use where no schedule chooses, (1, 10)."""
+        """Q, S, R in use without a schedule, (1, 10)."""
         weights: Array = self.switching.tables[:, 0]
         return weights
 
-    def new_ladder(self) -> Ladder:
-        """For a vehicle that no solve has failed for."""
-        return Ladder(self._fallback.new_memory())
+    def new_fallback(self) -> Fallback:
+        """Create the fallback's memory of one vehicle, without any failed solve."""
+        return Fallback(self._stanley.new_memory())
 
     def situation(self, observation: TrackingObservation) -> tuple[Array, Array, Array]:
-        """The problem's parameters from an observation, in the frame of the path's foot point.
+        """Compute the problem's parameters, in the frame of the path's foot point.
 
         Returns
         -------
@@ -147,42 +145,45 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
     def replace(
         self,
         observation: TrackingObservation,
-        ladder: Ladder,
+        fallback: Fallback,
         status: str,
         plan: Array | None,
         age: int,
         failures: int,
     ) -> tuple[float, float]:
-        """Inputs in place of a failed solve: the next rung of the ladder.
+        """Compute inputs (a, delta) in place of a failed solve.
+
+        The last plan's next input while the plan lasts, else those of Stanley's controller; after
+        `max_failures` failures in a row, braking to a stop with Stanley's steering.
 
         Parameters
         ----------
         observation
-            Of one vehicle.
-        ladder
-            Of this vehicle.
+            The vehicle's observation.
+        fallback
+            The vehicle's fallback, updated here.
         status
-            Of the failed solve.
+            Status of the failed solve.
         plan
-            The last plan that was solved, inputs (N, 2), if any.
+            Inputs (N, 2) of the last plan, if any.
         age
             Control periods since that plan was made.
         failures
             Failed solves in a row, this one included.
         """
-        ladder.counts[status] += 1
-        # Kept up to date on every rung, since Stanley's own memory belongs to a driven episode.
-        seen = all(np.isfinite(entry).all() for entry in observation)
-        fallback = self._fallback.control if seen else self._fallback.control_blind
-        a, delta = fallback(observation, ladder.stanley)
+        fallback.counts[status] += 1
+        # Stanley's memory is updated even where its inputs are not used.
+        finite = all(np.isfinite(entry).all() for entry in observation)
+        control = self._stanley.control if finite else self._stanley.control_blind
+        a, delta = control(observation, fallback.stanley)
         stage = int(age * self.task.control_period / self.problem.period + 1e-9)
         if failures > self.max_failures:
-            ladder.fallback = "stop"
+            fallback.used = "stop"
             a, _ = super().control_blind(observation, None)  # type: ignore[arg-type]
         elif plan is not None and stage < len(plan):
-            ladder.fallback = "plan"
+            fallback.used = "plan"
             a, delta = (float(value) for value in plan[stage])
         else:
-            ladder.fallback = "stanley"
-        ladder.counts[ladder.fallback] += 1
+            fallback.used = "stanley"
+        fallback.counts[fallback.used] += 1
         return a, delta

@@ -1,15 +1,15 @@
 """LPV-MPC with A and B frozen along the last plan: a demonstration, not a controller to use.
 
-The quasi-LPV form x' = A(x, u) x + B(u) u equals the vehicle's field exactly, so one may be tempted
-to freeze its matrices along the last plan and to solve one quadratic program a period. That drops
-the derivatives of A and B, and one of them is what steers: A as printed in kumar2025lpv has no
-column of psi in the rows of X and Y. The program then believes that turning does not move the car
-sideways. Writing sin(psi_ref + e) by sinc(e) e, with e the deviation from the plan's direction of
-travel, puts such a column into the very same field, and the program steers.
+The quasi-LPV form x' = A(x, u) x + B(u) u equals the vehicle's field exactly, so it is tempting to
+freeze its matrices along the last plan and to solve one QP per period. That drops the derivatives
+of A and B, one of which is essential for steering: A as printed in kumar2025lpv has no column of
+psi in the rows of X and Y, so in the QP turning does not move the car sideways. Writing
+sin(psi_ref + e) by means of sinc(e) e, with e the deviation from the plan's direction of travel,
+adds this column to the same field, and the QP steers.
 """
 
 import time
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,9 @@ from agents.nmpc.ipopt_agent import SolvedNmpc
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.nmpc.rti_solver import RtiSolver
-from agents.weights import TrackingWeights, WeightSchedule
+from agents.nmpc.settings import NmpcSettings, passes_settings
 from lpv_track_env.bicycle import PSI, VX, VY, X, Y
 from lpv_track_env.lpv import matrices
-from lpv_track_env.vehicle import VehicleParameters
 from trajectories.naming import choose
 
 Array = NDArray[np.float64]
@@ -32,7 +31,7 @@ FORMS = ("literal", "sinc")
 
 
 class FrozenLpvSolver:
-    """One quadratic program a period, its model A(x, u) x + B(u) u frozen along a plan.
+    """Solver of one QP per period, with the model A(x, u) x + B(u) u frozen along a plan.
 
     Parameters
     ----------
@@ -75,9 +74,10 @@ class FrozenLpvSolver:
         return solution._replace(seconds=time.perf_counter() - began), solution.inputs
 
     def freeze(self, state: Array, inputs: Array, heading: Array) -> Linearisation:
-        """Model frozen along the roll-out of `inputs` (N, 2) from `state` (6,), in discrete time.
+        """Freeze the model along the roll-out of `inputs` (N, 2) from `state` (6,), discretised.
 
-        `heading` (N + 1,) rad is the reference's. The model's own states follow it, not the field.
+        `heading` (N + 1,) rad is that of the reference. The returned states are those of the frozen
+        model, not of the field.
         """
         along = self._rti.linearise(state, inputs).states
         n = len(inputs)
@@ -94,7 +94,7 @@ class FrozenLpvSolver:
         return Linearisation(states, a_all, b_all, rate, rate_x, rate_u)
 
     def _continuous(self, x: Array, u: Array, heading: float) -> tuple[Array, Array, Array]:
-        """A (6, 6), B (6, 2) and what is left over (6,), whose sum A x + B u + c is the field."""
+        """A (6, 6), B (6, 2) and a constant c (6,) such that A x + B u + c is the field."""
         a, b = matrices(x, u, self.problem.vehicle)
         constant = np.zeros(6)
         if self.form == "sinc":
@@ -119,16 +119,16 @@ def _held(a: Array, b: Array, constant: Array, period: float) -> tuple[Array, Ar
 
 
 class FrozenLpvMpc(SolvedNmpc):
-    """LPV-MPC with frozen matrices, to show what that leaves out. Use `lpv-nmpc` to drive.
+    """LPV-MPC with frozen matrices, to show what they leave out. Use `lpv-nmpc` to drive.
 
     Parameters
     ----------
     task
-        What is driven.
+        Task of the agent.
     form
         "literal" or "sinc", see `FrozenLpvSolver`.
-    horizon, weights, selection, model, linear_penalty, quadratic_penalty, max_failures
-        See `RtiNmpc`.
+    **settings
+        Settings of all NMPC agents, see `NmpcSettings`.
 
     Raises
     ------
@@ -136,27 +136,7 @@ class FrozenLpvMpc(SolvedNmpc):
         If a setting is out of range, or the form unknown.
     """
 
-    def __init__(
-        self,
-        task: DrivingTask,
-        *,
-        form: str = "literal",
-        horizon: int | None = None,
-        weights: TrackingWeights | WeightSchedule | str | Path | None = None,
-        selection: str = "band",
-        model: VehicleParameters | None = None,
-        linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),
-        quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0),
-        max_failures: int = 10,
-    ) -> None:
-        super().__init__(
-            task,
-            horizon=horizon,
-            weights=weights,
-            selection=selection,
-            model=model,
-            linear_penalty=linear_penalty,
-            quadratic_penalty=quadratic_penalty,
-            max_failures=max_failures,
-        )
+    @passes_settings(NmpcSettings)
+    def __init__(self, task: DrivingTask, *, form: str = "literal", **settings: Any) -> None:
+        super().__init__(task, NmpcSettings(**settings))
         self.solver = FrozenLpvSolver(self.problem, form=form)

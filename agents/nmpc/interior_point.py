@@ -14,51 +14,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from agents.nmpc.layout import (
-    BARRIER_A,
-    BARRIER_CROSS,
-    BARRIER_RATE,
-    BARRIER_VX,
-    BARRIER_VY,
-    BOTTOM,
-    BOTTOM_RATE,
-    BOTTOM_RATIO,
-    CHANGE_A,
-    CHANGE_DELTA,
-    DLAM,
-    DT,
-    FORCE,
-    GAP,
-    HIGH_A,
-    INVERSE,
-    LAM,
-    LINEAR,
-    LINEAR_RATE,
-    LINEAR_RATIO,
-    LONGEST,
-    LOW_A,
-    MAX_DELTA,
-    PAIRS,
-    QUADRATIC,
-    QUADRATIC_RATE,
-    QUADRATIC_RATIO,
-    RATIO,
-    RESIDUAL,
-    SLOPE_A,
-    SLOPE_RATE,
-    SLOPE_VX,
-    SLOPE_VY,
-    STEP_A,
-    STEP_DELTA,
-    STEP_R,
-    STEP_VX,
-    STEP_VY,
-    TOP,
-    TOP_RATE,
-    TOP_RATIO,
-    WEIGHT,
-    T,
-)
+from agents.nmpc import layout as L
 from agents.nmpc.linearisation import RATE_DELTA, RATE_R, RATE_VX, RATE_VY
 from trajectories.compilation import compiled_internal
 
@@ -81,26 +37,26 @@ def start(lanes: Array, constants: Array) -> Float:
     for i in range(lanes.shape[1]):
         for k in range(8):
             if k < 2:
-                reach = constants[HIGH_A] - constants[LOW_A]
+                reach = constants[L.HIGH_A] - constants[L.LOW_A]
             elif k < 4:
-                reach = 2.0 * constants[MAX_DELTA]
+                reach = 2.0 * constants[L.MAX_DELTA]
             else:
-                reach = 2.0 * constants[CHANGE_A if k < 6 else CHANGE_DELTA]
-            gap = lanes[GAP + k, i]
+                reach = 2.0 * constants[L.CHANGE_A if k < 6 else L.CHANGE_DELTA]
+            gap = lanes[L.GAP + k, i]
             t = max(gap, START_DISTANCE * reach)
             worst = max(worst, t - gap)
-            lanes[T + k, i], lanes[RESIDUAL + k, i] = t, t - gap
-            lanes[LAM + k, i] = START_BARRIER / t
+            lanes[L.T + k, i], lanes[L.RESIDUAL + k, i] = t, t - gap
+            lanes[L.LAM + k, i] = START_BARRIER / t
         for soft in range(3):
             first = 8 + 3 * soft
-            high, low = lanes[GAP + first, i], lanes[GAP + first + 1, i]
-            least = START_BARRIER / (constants[LINEAR + soft] + 1e-3)
+            high, low = lanes[L.GAP + first, i], lanes[L.GAP + first + 1, i]
+            least = START_BARRIER / (constants[L.LINEAR + soft] + 1e-3)
             slack = max(-min(high, low), 0.0) + least
-            lanes[T + first, i], lanes[T + first + 1, i] = high + slack, low + slack
-            lanes[T + first + 2, i] = slack
+            lanes[L.T + first, i], lanes[L.T + first + 1, i] = high + slack, low + slack
+            lanes[L.T + first + 2, i] = slack
             for k in range(first, first + 3):
-                lanes[RESIDUAL + k, i] = 0.0
-                lanes[LAM + k, i] = START_BARRIER / lanes[T + k, i]
+                lanes[L.RESIDUAL + k, i] = 0.0
+                lanes[L.LAM + k, i] = START_BARRIER / lanes[L.T + k, i]
     return worst
 
 
@@ -112,63 +68,63 @@ def weigh(lanes: Array, constants: Array) -> None:
     numbers.
     """
     n = lanes.shape[1]
-    for k in range(PAIRS):
-        t, lam, correction = lanes[T + k], lanes[LAM + k], lanes[DT + k]
-        inverse, weight = lanes[INVERSE + k], lanes[WEIGHT + k]
+    for k in range(L.PAIRS):
+        t, lam, correction = lanes[L.T + k], lanes[L.LAM + k], lanes[L.DT + k]
+        inverse, weight = lanes[L.INVERSE + k], lanes[L.WEIGHT + k]
         for i in range(n):
             inverse[i] = 1.0 / t[i]
             weight[i] = lam[i] * inverse[i]
             correction[i] = 0.0
-    ratio = constants[RATIO]
-    w = lanes[WEIGHT : WEIGHT + PAIRS]
+    ratio = constants[L.RATIO]
+    w = lanes[L.WEIGHT : L.WEIGHT + L.PAIRS]
     for i in range(n):
         for f in range(4):
-            lanes[BARRIER_A + f, i] = w[2 * f, i] + w[2 * f + 1, i]
-        w1, w2, w3, quadratic = w[8, i], w[9, i], w[10, i], constants[QUADRATIC]
+            lanes[L.BARRIER_A + f, i] = w[2 * f, i] + w[2 * f + 1, i]
+        w1, w2, w3, quadratic = w[8, i], w[9, i], w[10, i], constants[L.QUADRATIC]
         bottom = 1.0 / (quadratic + w1 + w2 + w3)
         vx = ((w1 + w2) * (quadratic + w3) + 4.0 * w1 * w2) * bottom
-        lanes[BOTTOM, i] = bottom
-        w1, w2, w3, quadratic = w[11, i], w[12, i], w[13, i], constants[QUADRATIC_RATE]
+        lanes[L.BOTTOM, i] = bottom
+        w1, w2, w3, quadratic = w[11, i], w[12, i], w[13, i], constants[L.QUADRATIC_RATE]
         bottom = 1.0 / (quadratic + w1 + w2 + w3)
-        lanes[BARRIER_RATE, i] = ((w1 + w2) * (quadratic + w3) + 4.0 * w1 * w2) * bottom
-        lanes[BOTTOM_RATE, i] = bottom
-        w1, w2, w3, quadratic = w[14, i], w[15, i], w[16, i], constants[QUADRATIC_RATIO]
+        lanes[L.BARRIER_RATE, i] = ((w1 + w2) * (quadratic + w3) + 4.0 * w1 * w2) * bottom
+        lanes[L.BOTTOM_RATE, i] = bottom
+        w1, w2, w3, quadratic = w[14, i], w[15, i], w[16, i], constants[L.QUADRATIC_RATIO]
         bottom = 1.0 / (quadratic + w1 + w2 + w3)
         apart = (quadratic + w3) * bottom
-        lanes[BARRIER_VX, i] = vx + ratio * ratio * (w1 + w2) * apart
-        lanes[BARRIER_CROSS, i] = ratio * (w2 - w1) * apart
-        lanes[BARRIER_VY, i] = (w1 + w2) * apart + 4.0 * w1 * w2 * bottom
-        lanes[BOTTOM_RATIO, i] = bottom
+        lanes[L.BARRIER_VX, i] = vx + ratio * ratio * (w1 + w2) * apart
+        lanes[L.BARRIER_CROSS, i] = ratio * (w2 - w1) * apart
+        lanes[L.BARRIER_VY, i] = (w1 + w2) * apart + 4.0 * w1 * w2 * bottom
+        lanes[L.BOTTOM_RATIO, i] = bottom
 
 
 @compiled_internal
 def press(lanes: Array, constants: Array, share: Float) -> None:
     """Fill what the pairs, and their corrections in the rows of dt, add to the gradient."""
     n = lanes.shape[1]
-    for k in range(PAIRS):
-        force, correction = lanes[FORCE + k], lanes[DT + k]
-        weight, residual = lanes[WEIGHT + k], lanes[RESIDUAL + k]
+    for k in range(L.PAIRS):
+        force, correction = lanes[L.FORCE + k], lanes[L.DT + k]
+        weight, residual = lanes[L.WEIGHT + k], lanes[L.RESIDUAL + k]
         for i in range(n):
             force[i] = correction[i] + weight[i] * share * residual[i]
-    ratio = constants[RATIO]
-    w, b = lanes[WEIGHT : WEIGHT + PAIRS], lanes[FORCE : FORCE + PAIRS]
+    ratio = constants[L.RATIO]
+    w, b = lanes[L.WEIGHT : L.WEIGHT + L.PAIRS], lanes[L.FORCE : L.FORCE + L.PAIRS]
     for i in range(n):
         for f in range(4):
-            lanes[SLOPE_A + f, i] = b[2 * f, i] - b[2 * f + 1, i]
-        b1, b2, slack = b[8, i], b[9, i], lanes[T + 10, i]
-        top = b1 + b2 + b[10, i] - constants[LINEAR] - constants[QUADRATIC] * slack
-        vx = b1 - b2 - (w[8, i] - w[9, i]) * top * lanes[BOTTOM, i]
-        lanes[TOP, i] = top
-        b1, b2, slack = b[11, i], b[12, i], lanes[T + 13, i]
-        top = b1 + b2 + b[13, i] - constants[LINEAR_RATE] - constants[QUADRATIC_RATE] * slack
-        lanes[SLOPE_RATE, i] = b1 - b2 - (w[11, i] - w[12, i]) * top * lanes[BOTTOM_RATE, i]
-        lanes[TOP_RATE, i] = top
-        b1, b2, slack = b[14, i], b[15, i], lanes[T + 16, i]
-        top = b1 + b2 + b[16, i] - constants[LINEAR_RATIO] - constants[QUADRATIC_RATIO] * slack
-        taken = top * lanes[BOTTOM_RATIO, i]
+            lanes[L.SLOPE_A + f, i] = b[2 * f, i] - b[2 * f + 1, i]
+        b1, b2, slack = b[8, i], b[9, i], lanes[L.T + 10, i]
+        top = b1 + b2 + b[10, i] - constants[L.LINEAR] - constants[L.QUADRATIC] * slack
+        vx = b1 - b2 - (w[8, i] - w[9, i]) * top * lanes[L.BOTTOM, i]
+        lanes[L.TOP, i] = top
+        b1, b2, slack = b[11, i], b[12, i], lanes[L.T + 13, i]
+        top = b1 + b2 + b[13, i] - constants[L.LINEAR_RATE] - constants[L.QUADRATIC_RATE] * slack
+        lanes[L.SLOPE_RATE, i] = b1 - b2 - (w[11, i] - w[12, i]) * top * lanes[L.BOTTOM_RATE, i]
+        lanes[L.TOP_RATE, i] = top
+        b1, b2, slack = b[14, i], b[15, i], lanes[L.T + 16, i]
+        top = b1 + b2 + b[16, i] - constants[L.LINEAR_RATIO] - constants[L.QUADRATIC_RATIO] * slack
+        taken = top * lanes[L.BOTTOM_RATIO, i]
         right, left = b1 - w[14, i] * taken, b2 - w[15, i] * taken
-        lanes[SLOPE_VX, i], lanes[SLOPE_VY, i] = vx - ratio * (right + left), right - left
-        lanes[TOP_RATIO, i] = top
+        lanes[L.SLOPE_VX, i], lanes[L.SLOPE_VY, i] = vx - ratio * (right + left), right - left
+        lanes[L.TOP_RATIO, i] = top
 
 
 @compiled_internal
@@ -178,17 +134,17 @@ def expand(stages: Array, lanes: Array, constants: Array, share: Float) -> Float
     The length is at most 1 and goes all the way to the nearest bound.
     """
     n = lanes.shape[1]
-    ratio = constants[RATIO]
+    ratio = constants[L.RATIO]
     before_a = before_delta = 0.0
     dt, rest, w = (
-        lanes[DT : DT + PAIRS],
-        lanes[RESIDUAL : RESIDUAL + 8],
-        lanes[WEIGHT : WEIGHT + PAIRS],
+        lanes[L.DT : L.DT + L.PAIRS],
+        lanes[L.RESIDUAL : L.RESIDUAL + 8],
+        lanes[L.WEIGHT : L.WEIGHT + L.PAIRS],
     )
-    longest = lanes[LONGEST]
+    longest = lanes[L.LONGEST]
     for i in range(n):
         e, end = stages[i], stages[i + 1]
-        a, delta, vx, vy = e[STEP_A], e[STEP_DELTA], end[STEP_VX], end[STEP_VY]
+        a, delta, vx, vy = e[L.STEP_A], e[L.STEP_DELTA], end[L.STEP_VX], end[L.STEP_VY]
         change_a, change_delta = a - before_a, delta - before_delta
         before_a, before_delta = a, delta
         dt[0, i], dt[1, i] = -a - share * rest[0, i], a - share * rest[1, i]
@@ -196,20 +152,20 @@ def expand(stages: Array, lanes: Array, constants: Array, share: Float) -> Float
         dt[4, i], dt[5, i] = -change_a - share * rest[4, i], change_a - share * rest[5, i]
         dt[6, i] = -change_delta - share * rest[6, i]
         dt[7, i] = change_delta - share * rest[7, i]
-        slack = (lanes[TOP, i] + (w[8, i] - w[9, i]) * vx) * lanes[BOTTOM, i]
+        slack = (lanes[L.TOP, i] + (w[8, i] - w[9, i]) * vx) * lanes[L.BOTTOM, i]
         dt[8, i], dt[9, i], dt[10, i] = slack - vx, slack + vx, slack
-        rate = e[RATE_VX] * e[STEP_VX] + e[RATE_VY] * e[STEP_VY] + e[RATE_R] * e[STEP_R]
+        rate = e[RATE_VX] * e[L.STEP_VX] + e[RATE_VY] * e[L.STEP_VY] + e[RATE_R] * e[L.STEP_R]
         rate = rate + a + e[RATE_DELTA] * delta
-        slack = (lanes[TOP_RATE, i] + (w[11, i] - w[12, i]) * rate) * lanes[BOTTOM_RATE, i]
+        slack = (lanes[L.TOP_RATE, i] + (w[11, i] - w[12, i]) * rate) * lanes[L.BOTTOM_RATE, i]
         dt[11, i], dt[12, i], dt[13, i] = slack - rate, slack + rate, slack
         right, left = ratio * vx - vy, ratio * vx + vy
-        slack = lanes[TOP_RATIO, i] - w[14, i] * right - w[15, i] * left
-        slack *= lanes[BOTTOM_RATIO, i]
+        slack = lanes[L.TOP_RATIO, i] - w[14, i] * right - w[15, i] * left
+        slack *= lanes[L.BOTTOM_RATIO, i]
         dt[14, i], dt[15, i], dt[16, i] = slack + right, slack + left, slack
         longest[i] = 1e-9
-    for k in range(PAIRS):
-        lam, step, dlam, inverse = lanes[LAM + k], dt[k], lanes[DLAM + k], lanes[INVERSE + k]
-        weight, force, residual = w[k], lanes[FORCE + k], lanes[RESIDUAL + k]
+    for k in range(L.PAIRS):
+        lam, step, dlam, inverse = lanes[L.LAM + k], dt[k], lanes[L.DLAM + k], lanes[L.INVERSE + k]
+        weight, force, residual = w[k], lanes[L.FORCE + k], lanes[L.RESIDUAL + k]
         for i in range(n):
             # force holds w share residual, which dt has taken off again.
             dlam[i] = force[i] - weight[i] * (step[i] + share * residual[i]) - lam[i]
@@ -227,17 +183,17 @@ def centre(lanes: Array, length: Float, mu: Float) -> None:
 
     (target - dt dlam) / t, with Mehrotra's target for the products and the second-order correction.
     """
-    reached, n = lanes[LONGEST], lanes.shape[1]
+    reached, n = lanes[L.LONGEST], lanes.shape[1]
     for i in range(n):
         reached[i] = 0.0
-    for k in range(PAIRS):
-        t, lam, dt, dlam = lanes[T + k], lanes[LAM + k], lanes[DT + k], lanes[DLAM + k]
+    for k in range(L.PAIRS):
+        t, lam, dt, dlam = lanes[L.T + k], lanes[L.LAM + k], lanes[L.DT + k], lanes[L.DLAM + k]
         for i in range(n):
             reached[i] += (t[i] + length * dt[i]) * (lam[i] + length * dlam[i])
-    share = _sum(reached) / (mu * PAIRS * n)
+    share = _sum(reached) / (mu * L.PAIRS * n)
     target = share * share * share * mu
-    for k in range(PAIRS):
-        dt, dlam, inverse = lanes[DT + k], lanes[DLAM + k], lanes[INVERSE + k]
+    for k in range(L.PAIRS):
+        dt, dlam, inverse = lanes[L.DT + k], lanes[L.DLAM + k], lanes[L.INVERSE + k]
         for i in range(n):
             dt[i] = (target - dt[i] * dlam[i]) * inverse[i]
 
@@ -245,16 +201,16 @@ def centre(lanes: Array, length: Float, mu: Float) -> None:
 @compiled_internal
 def update(lanes: Array, length: Float) -> Float:
     """Take a step of all pairs; returns the mean product t lam."""
-    product, n = lanes[LONGEST], lanes.shape[1]
+    product, n = lanes[L.LONGEST], lanes.shape[1]
     for i in range(n):
         product[i] = 0.0
-    for k in range(PAIRS):
-        t, lam, dt, dlam = lanes[T + k], lanes[LAM + k], lanes[DT + k], lanes[DLAM + k]
+    for k in range(L.PAIRS):
+        t, lam, dt, dlam = lanes[L.T + k], lanes[L.LAM + k], lanes[L.DT + k], lanes[L.DLAM + k]
         for i in range(n):
             t[i] += length * dt[i]
             lam[i] += length * dlam[i]
             product[i] += t[i] * lam[i]
-    return _sum(product) / (PAIRS * n)
+    return _sum(product) / (L.PAIRS * n)
 
 
 @compiled_internal

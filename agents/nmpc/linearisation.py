@@ -1,17 +1,17 @@
 """The NMPC's discrete model and its exact derivatives, compiled.
 
-The same map as `casadi_solver.discrete_model`: classic Runge-Kutta steps of the vector field over a
-period, inputs held. A period is integrated in the frame of the vehicle at its start, since the
-motion does not depend on where the vehicle is nor where it heads: sines of small angles are then
-enough, and derivatives with respect to heading and position need no integration at all.
+The model is that of `casadi_solvers.discrete_model`: classic Runge-Kutta steps of the vector field
+over a period, with constant inputs. A period is integrated in the frame of the vehicle at its
+start, since the motion does not depend on position and heading: only small angles are rotated, and
+the derivatives by heading and position need no integration.
 
-A period's derivatives fill the record of its stage (`layout`)::
+The derivatives of a period are stored in its stage (`layout`), in this order::
 
     0..17   columns vx, vy, r of A, six rows each     18, 19  A[X, psi], A[Y, psi]
     20..31  columns a, delta of B, six rows each
     32      vx' at the period's start                 33..36  its derivatives by vx, vy, r, delta
 
-The other columns of A are unit columns, and dvx'/da is 1.
+The other columns of A are unit vectors, and dvx'/da is 1.
 """
 
 import math
@@ -20,21 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc.layout import (
-    PLAN_A,
-    PLAN_DELTA,
-    PLAN_PSI,
-    PLAN_R,
-    PLAN_VX,
-    PLAN_VY,
-    PLAN_X,
-    PLAN_Y,
-    RECORD,
-    SENSITIVITY,
-    SUBSTEP,
-    SUBSTEPS,
-)
-from agents.nmpc.vectors import plus, scaled
+from agents.nmpc import layout as L
 from lpv_track_env.bicycle import (
     PSI,
     VX,
@@ -51,12 +37,13 @@ from lpv_track_env.integration import integrate, rotate
 from trajectories.compilation import compiled, compiled_internal
 
 Array = NDArray[Any]
-# Floats inside compiled code; numba ignores annotations, mypy sees what a caller passes.
+# Floats, and vectors of six as tuples, in compiled code: numba ignores annotations.
 Float = Any
+Six = Any
 
 HEADING_X, HEADING_Y, RATE, RATE_VX, RATE_VY, RATE_R, RATE_DELTA = 18, 19, 32, 33, 34, 35, 36
 SEEDS = 5
-"""Directions that are integrated: vx, vy, r at the period's start, a, delta."""
+"""Number of integrated directions: vx, vy, r at the period's start, a, delta."""
 DYNAMIC = (VX, VY, YAW_RATE)
 
 
@@ -69,17 +56,56 @@ class Linearisation(NamedTuple):
     rate: Array
     """vx' at each period's start, (N,) m/s^2."""
     rate_x: Array
-    """Its derivatives by the state, (N, 6)."""
+    """Derivatives of vx' by the state, (N, 6)."""
     rate_u: Array
-    """Its derivatives by the input, (N, 2)."""
+    """Derivatives of vx' by the input, (N, 2)."""
+
+
+@compiled_internal
+def taken(values: Array, at: int) -> Six:
+    """Six entries of an array, from `at` on."""
+    return (
+        values[at], values[at + 1], values[at + 2], values[at + 3], values[at + 4], values[at + 5],
+    )  # fmt: skip
+
+
+@compiled_internal
+def dot(x: Six, y: Six) -> Float:
+    """Inner product x' y."""
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3] + x[4] * y[4] + x[5] * y[5]
+
+
+@compiled_internal
+def plus(x: Six, y: Six) -> Six:
+    """Sum x + y."""
+    return x[0] + y[0], x[1] + y[1], x[2] + y[2], x[3] + y[3], x[4] + y[4], x[5] + y[5]
+
+
+@compiled_internal
+def scaled(x: Six, by: Float) -> Six:
+    """Vector x times a number."""
+    return x[0] * by, x[1] * by, x[2] * by, x[3] * by, x[4] * by, x[5] * by
+
+
+@compiled_internal
+def mixed(a: Float, x: Six, b: Float, y: Six) -> Six:
+    """Linear combination a x + b y."""
+    return (
+        a * x[0] + b * y[0],
+        a * x[1] + b * y[1],
+        a * x[2] + b * y[2],
+        a * x[3] + b * y[3],
+        a * x[4] + b * y[4],
+        a * x[5] + b * y[5],
+    )
 
 
 @compiled_internal
 def advance(state: Any, a: Float, delta: Float, p: Array) -> Any:
-    """State (vx, vy, psi, r, X, Y) a period later, inputs held, by the model `p` (constants)."""
+    """State (vx, vy, psi, r, X, Y) after a period with constant inputs; `p` are the constants."""
     vx, vy, psi, r, x, y = integrate(
         state[VX], state[VY], 0.0, state[YAW_RATE], 0.0, 0.0, a, delta,
-        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[SUBSTEP], int(p[SUBSTEPS]),
+        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[L.SUBSTEP], int(p[L.SUBSTEPS]),
     )  # fmt: skip
     c, s = math.cos(state[PSI]), math.sin(state[PSI])
     return vx, vy, state[PSI] + psi, r, state[X] + c * x - s * y, state[Y] + s * x + c * y
@@ -90,7 +116,7 @@ def _rates(
     vx: Float, vy: Float, r: Float, c: Float, s: Float, a: Float, delta: Float, cd: Float,
     sd: Float, p: Any,
 ) -> Any:  # fmt: skip
-    """The field and its Jacobian, `p` the model's 7 parameters."""
+    """Vector field and its Jacobian; `p` are the model's 7 parameters."""
     m, iz, lf, lr, caf, car, mu = p
     q, slope = compiled_inverse_speed(vx), compiled_inverse_speed_slope(vx)
     return (
@@ -120,7 +146,7 @@ def _further(
     j: Any, zx: Float, zy: Float, zp: Float, zr: Float, step: Float, d: Any, by_a: Float,
     by_delta: Float, c: Float, s: Float, k: Any,
 ) -> Any:  # fmt: skip
-    """The same, where the direction has moved on by `step` times its rate d."""
+    """`_directional` for a direction that has moved by `step` times its rate d."""
     return _directional(
         j, zx + step * d[0], zy + step * d[1], zp + step * d[2], zr + step * d[3],
         by_a, by_delta, c, s, k,
@@ -129,25 +155,26 @@ def _further(
 
 @compiled_internal
 def _weighted(k1: Any, k2: Any, k3: Any, k4: Any) -> Any:
-    """Classic Runge-Kutta's sum of its four rates."""
+    """Weighted sum of the four rates of a classic Runge-Kutta step, times 6."""
     return plus(plus(k1, scaled(plus(k2, k3), 2.0)), k4)
 
 
 @compiled_internal
 def differentiate(e: Array, p: Array, out: Array) -> None:
-    """Do what `advance` does from a stage e to the next, `out`, and fill the stage's record.
+    """Advance the plan's state from stage e to the next, `out`, and fill the derivatives of e.
 
-    Forward sensitivities through the stages of every Runge-Kutta step: dk = J dz + J_u, exact to
-    rounding for the discrete map (not for the flow that it approximates).
+    The state is that of `advance`. Forward sensitivities through the stages of every Runge-Kutta
+    step, dk = J dz + J_u: exact to rounding for the discrete map, not for the flow that it
+    approximates.
     """
-    h, n = p[SUBSTEP], int(p[SUBSTEPS])
+    h, n = p[L.SUBSTEP], int(p[L.SUBSTEPS])
     model = (p[0], p[1], p[2], p[3], p[4], p[5], p[6])
-    a, delta = e[PLAN_A], e[PLAN_DELTA]
-    vx, vy, r = e[PLAN_VX], e[PLAN_VY], e[PLAN_R]
+    a, delta = e[L.PLAN_A], e[L.PLAN_DELTA]
+    vx, vy, r = e[L.PLAN_VX], e[L.PLAN_VY], e[L.PLAN_R]
     c, s, psi, x, y = 1.0, 0.0, 0.0, 0.0, 0.0
     cd, sd = math.cos(delta), math.sin(delta)
     half, sixth = 0.5 * h, h / 6.0
-    z = e[SENSITIVITY : SENSITIVITY + 6 * SEEDS]
+    z = e[L.SENSITIVITY : L.SENSITIVITY + 6 * SEEDS]
     for k in range(6 * SEEDS):
         z[k] = 0.0
     z[0], z[SEEDS + 1], z[3 * SEEDS + 2] = 1.0, 1.0, 1.0
@@ -192,7 +219,7 @@ def differentiate(e: Array, p: Array, out: Array) -> None:
         x += d[4]
         y += d[5]
         c, s = rotate(c, s, d[2])
-    c0, s0 = math.cos(e[PLAN_PSI]), math.sin(e[PLAN_PSI])
+    c0, s0 = math.cos(e[L.PLAN_PSI]), math.sin(e[L.PLAN_PSI])
     for k in range(SEEDS):
         first = 6 * k if k < 3 else 6 * k + 2
         for row in range(4):
@@ -202,21 +229,21 @@ def differentiate(e: Array, p: Array, out: Array) -> None:
         e[first + Y] = s0 * zx + c0 * zy
     east, north = c0 * x - s0 * y, s0 * x + c0 * y
     e[HEADING_X], e[HEADING_Y] = -north, east
-    out[PLAN_VX], out[PLAN_VY], out[PLAN_R] = vx, vy, r
-    out[PLAN_PSI] = e[PLAN_PSI] + psi
-    out[PLAN_X], out[PLAN_Y] = e[PLAN_X] + east, e[PLAN_Y] + north
+    out[L.PLAN_VX], out[L.PLAN_VY], out[L.PLAN_R] = vx, vy, r
+    out[L.PLAN_PSI] = e[L.PLAN_PSI] + psi
+    out[L.PLAN_X], out[L.PLAN_Y] = e[L.PLAN_X] + east, e[L.PLAN_Y] + north
 
 
 @compiled
 def differentiate_along(stages: Array, constants: Array) -> None:
-    """Roll the plan out from its first state, in `stages`, and fill the records along the way."""
+    """Roll the plan in `stages` out from its first state, and fill all stages' derivatives."""
     for i in range(stages.shape[0] - 1):
         differentiate(stages[i], constants, stages[i + 1])
 
 
 def unpacked(stages: Array) -> Linearisation:
-    """Full matrices from the records of stages."""
-    records, states = stages[:-1, :RECORD], stages[:, PLAN_VX : PLAN_Y + 1]
+    """Return the derivatives of all stages as full matrices."""
+    records, states = stages[:-1, : L.DERIVATIVES], stages[:, L.PLAN_VX : L.PLAN_Y + 1]
     n = len(records)
     a_matrices = np.tile(np.eye(6), (n, 1, 1))
     b_matrices = np.zeros((n, 6, 2))
@@ -234,12 +261,12 @@ def unpacked(stages: Array) -> Linearisation:
 
 
 def pack(model: Linearisation, inputs: Array, stages: Array) -> None:
-    """Put a linear model along `inputs` (N, 2) into stages: the inverse of `unpacked`.
+    """Write a linear model along `inputs` (N, 2) into the stages: the inverse of `unpacked`.
 
-    Entries of A and B that a record does not hold are taken to be those that it implies.
+    Entries of A and B that the stages do not store are assumed to be the constants above.
     """
-    stages[:, PLAN_VX : PLAN_Y + 1] = model.states
-    stages[:-1, PLAN_A : PLAN_DELTA + 1] = inputs
+    stages[:, L.PLAN_VX : L.PLAN_Y + 1] = model.states
+    stages[:-1, L.PLAN_A : L.PLAN_DELTA + 1] = inputs
     for k, column in enumerate(DYNAMIC):
         stages[:-1, 6 * k : 6 * k + 6] = model.A[:, :, column]
         stages[:-1, RATE_VX + k] = model.rate_x[:, column]

@@ -1,20 +1,20 @@
-"""Newton steps of the NMPC's quadratic program by Riccati recursions over its stages.
+"""Newton steps of the NMPC's QP by Riccati recursions over its stages, compiled.
 
-One step minimises, over dx_0 = 0, dx_{i+1} = A_i dx_i + B_i du_i and du_{-1} = 0,
+A step minimises, over dx_0 = 0, dx_{i+1} = A_i dx_i + B_i du_i and du_{-1} = 0,
 
     sum_i 1/2 dx_i' Hx_i dx_i + gx_i' dx_i  +  1/2 du_i' Hu_i du_i + gu_i' du_i
         + 1/2 h_i (n_i' [dx_i; du_i])^2 + k_i n_i' [dx_i; du_i]
         + 1/2 (du_i - du_{i-1})' W_i (du_i - du_{i-1}) + w_i' (du_i - du_{i-1})
 
-with n_i the gradient of vx', Hu and W diagonal, and Hx diagonal but for (vx, vy). Hessians and
-gradients are the cost's own, which is taken at the solution so far, plus what the inequalities add
-(barrier and slope in the lanes of `layout`; those by vx and vy are at a period's end). The value
-function of stage i has as its arguments dx_i and p = du_{i-1}:
+with n_i the gradient of vx', Hu and W diagonal, and Hx diagonal except for the block of (vx, vy).
+Hessians and gradients are those of the cost, at the solution so far, plus the terms of the
+inequalities (barrier and slope in the lanes of `layout`; those of vx and vy hold at the end of a
+period). The value function of stage i depends on dx_i and p = du_{i-1}:
 
     1/2 x' P x + x' T p + 1/2 p' U p + s' x + t' p
 
-`factor` runs the matrix part once for a Hessian, `solve` the vector part for each gradient.
-Records of a period's derivatives are those of `linearisation`; all arrays those of `layout`.
+`factor` computes the matrix part once for a Hessian, `solve` the vector part for each gradient. The
+derivatives of a period are described in `linearisation`, all arrays in `layout`.
 """
 
 import math
@@ -22,53 +22,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from agents.nmpc.layout import (
-    BARRIER_A,
-    BARRIER_CHANGE_A,
-    BARRIER_CHANGE_DELTA,
-    BARRIER_CROSS,
-    BARRIER_DELTA,
-    BARRIER_RATE,
-    BARRIER_VX,
-    BARRIER_VY,
-    CARRY,
-    DAMPING_A,
-    DAMPING_DELTA,
-    GAIN_A,
-    GAIN_DELTA,
-    HOLD_A,
-    HOLD_DELTA,
-    INVERSE_AA,
-    INVERSE_AD,
-    INVERSE_DD,
-    NOW_A,
-    NOW_DELTA,
-    NOW_PSI,
-    NOW_VX,
-    NOW_X,
-    NOW_Y,
-    PLAN_A,
-    PLAN_DELTA,
-    REFERENCE,
-    REFERENCE_HEADING,
-    REFERENCE_X,
-    REFERENCE_Y,
-    SLOPE_A,
-    SLOPE_CHANGE_A,
-    SLOPE_CHANGE_DELTA,
-    SLOPE_DELTA,
-    SLOPE_RATE,
-    SLOPE_VX,
-    SLOPE_VY,
-    STEP_A,
-    STEP_DELTA,
-    STEP_PSI,
-    STEP_R,
-    STEP_VX,
-    STEP_VY,
-    STEP_X,
-    STEP_Y,
-)
+from agents.nmpc import layout as L
 from agents.nmpc.linearisation import (
     HEADING_X,
     HEADING_Y,
@@ -76,8 +30,13 @@ from agents.nmpc.linearisation import (
     RATE_R,
     RATE_VX,
     RATE_VY,
-)
-from agents.nmpc.vectors import Six, dot, mixed, plus, scaled, taken
+    Six,
+    dot,
+    mixed,
+    plus,
+    scaled,
+    taken,
+)  # fmt: skip
 from trajectories.compilation import compiled_internal
 
 Array = NDArray[Any]
@@ -88,7 +47,7 @@ NAN = math.nan
 
 @compiled_internal
 def _product(p: Any, v: Six) -> Six:
-    """P v for a symmetric P, of which the upper triangle is given row by row."""
+    """Product P v for a symmetric P, given by its upper triangle, row by row."""
     p00, p01, p02, p03, p04, p05, p11, p12, p13, p14, p15 = p[:11]
     p22, p23, p24, p25, p33, p34, p35, p44, p45, p55 = p[11:]
     v0, v1, v2, v3, v4, v5 = v
@@ -104,7 +63,7 @@ def _product(p: Any, v: Six) -> Six:
 
 @compiled_internal
 def _back(a0: Six, a1: Six, a3: Six, a42: Float, a52: Float, v: Six) -> Six:
-    """A' v: columns vx, vy and r of A are given whole, that of psi by its last two entries."""
+    """Product A' v: columns vx, vy, r of A are given in full, psi by its last two entries."""
     return (
         dot(a0, v), dot(a1, v), v[2] + a42 * v[4] + a52 * v[5], dot(a3, v), v[4], v[5],
     )  # fmt: skip
@@ -120,7 +79,7 @@ def _entry(
 
 @compiled_internal
 def _put(e: Array, at: int, ka: Six, by: Float, c: Six) -> None:
-    """Write ka + by c into a stage."""
+    """Write the vector ka + by c into a stage."""
     e[at], e[at + 1], e[at + 2] = ka[0] + by * c[0], ka[1] + by * c[1], ka[2] + by * c[2]
     e[at + 3], e[at + 4], e[at + 5] = ka[3] + by * c[3], ka[4] + by * c[4], ka[5] + by * c[5]
 
@@ -129,12 +88,12 @@ def _put(e: Array, at: int, ka: Six, by: Float, c: Six) -> None:
 def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> None:
     """Fill the stages' gains for weights (10,), the damping of `constants` and the barrier.
 
-    A matrix M that is not positive definite shows as gains that are not finite.
+    If a matrix M is not positive definite the gains are not finite.
     """
     n = lanes.shape[1]
-    ra, rd = weights[8] + constants[DAMPING_A], weights[9] + constants[DAMPING_DELTA]
-    p00 = weights[4] + lanes[BARRIER_VX, n - 1]
-    p01, p11 = lanes[BARRIER_CROSS, n - 1], lanes[BARRIER_VY, n - 1]
+    ra, rd = weights[8] + constants[L.DAMPING_A], weights[9] + constants[L.DAMPING_DELTA]
+    p00 = weights[4] + lanes[L.BARRIER_VX, n - 1]
+    p01, p11 = lanes[L.BARRIER_CROSS, n - 1], lanes[L.BARRIER_VY, n - 1]
     p22, p44, p55 = weights[5], weights[6], weights[7]
     p02 = p03 = p04 = p05 = p12 = p13 = p14 = p15 = p23 = p24 = p25 = p33 = p34 = p35 = p45 = 0.0
     # T's columns (by a and by delta of the input before) and U.
@@ -148,23 +107,22 @@ def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> Non
             p00, p01, p02, p03, p04, p05, p11, p12, p13, p14, p15, p22, p23, p24, p25, p33, p34,
             p35, p44, p45, p55,
         )  # fmt: skip
-        # (P B + T)': what the input meets of the state that follows. Then B' P B, with T and U:
-        # the Hessian by u of what follows.
+        # (P B + T)', then B' P B with T and U: the Hessian of the cost-to-go by u.
         ga, gd = plus(_product(p, ba), ta), plus(_product(p, bd), td)
-        h, n_delta = lanes[BARRIER_RATE, i], e[RATE_DELTA]
-        haa = ra + lanes[BARRIER_A, i] + dot(ba, ga) + dot(ba, ta) + uaa
-        hdd = rd + lanes[BARRIER_DELTA, i] + dot(bd, gd) + dot(bd, td) + udd
+        h, n_delta = lanes[L.BARRIER_RATE, i], e[RATE_DELTA]
+        haa = ra + lanes[L.BARRIER_A, i] + dot(ba, ga) + dot(ba, ta) + uaa
+        hdd = rd + lanes[L.BARRIER_DELTA, i] + dot(bd, gd) + dot(bd, td) + udd
         had = dot(bd, ga) + dot(ba, td) + uad
-        wa, wd = lanes[BARRIER_CHANGE_A, i], lanes[BARRIER_CHANGE_DELTA, i]
+        wa, wd = lanes[L.BARRIER_CHANGE_A, i], lanes[L.BARRIER_CHANGE_DELTA, i]
         maa, mdd = haa + wa, hdd + wd
         determinant = maa * mdd - had * had
-        # A determinant that is not positive gives NaN gains: the caller sees it.
+        # A determinant that is not positive gives NaN gains, which the caller checks.
         inverse = 1.0 / determinant if determinant > 0.0 else NAN
         iaa, idd, iad = mdd * inverse, maa * inverse, -had * inverse
         # G = B' P A + T' A.
         qa, qd = _back(a0, a1, a3, a42, a52, ga), _back(a0, a1, a3, a42, a52, gd)
-        # The term in vx' by Sherman and Morrison: h may be huge, and differences of what is huge
-        # would lose P. With m = (1, n_delta), y = M^-1 m, c = n - G' y: P gains k c c'.
+        # The term in vx' by Sherman and Morrison: h may be huge, and differences of huge numbers
+        # would cancel P. With m = (1, n_delta), y = M^-1 m, c = n - G' y: P gains k c c'.
         fa, fd = iaa + iad * n_delta, iad + idd * n_delta
         k = h / (1.0 + h * (fa + n_delta * fd))
         qa0, qa1, qa2, qa3, qa4, qa5 = qa
@@ -176,12 +134,13 @@ def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> Non
         ka, kd = mixed(iaa, qa, iad, qd), mixed(iad, qa, idd, qd)
         kfa, kfd = k * fa, k * fd
         c = (c0, c1, c2, c3, c4, c5)
-        _put(e, GAIN_A, ka, kfa, c)
-        _put(e, GAIN_DELTA, kd, kfd, c)
+        _put(e, L.GAIN_A, ka, kfa, c)
+        _put(e, L.GAIN_DELTA, kd, kfd, c)
         jaa, jad, jdd = iaa - kfa * fa, iad - kfa * fd, idd - kfd * fd
-        e[INVERSE_AA], e[INVERSE_AD], e[INVERSE_DD] = jaa, jad, jdd
-        e[CARRY], e[CARRY + 1], e[CARRY + 2], e[CARRY + 3] = jaa * wa, jad * wd, jad * wa, jdd * wd
-        e[HOLD_A], e[HOLD_DELTA] = wa, wd
+        e[L.INVERSE_AA], e[L.INVERSE_AD], e[L.INVERSE_DD] = jaa, jad, jdd
+        e[L.CARRY], e[L.CARRY + 1] = jaa * wa, jad * wd
+        e[L.CARRY + 2], e[L.CARRY + 3] = jad * wa, jdd * wd
+        e[L.HOLD_A], e[L.HOLD_DELTA] = wa, wd
         if i == 0:
             break
         y0, y1, y3 = _product(p, a0), _product(p, a1), _product(p, a3)
@@ -191,8 +150,8 @@ def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> Non
         y22 = p22 + a42 * p24 + a52 * p25
         y24 = p24 + a42 * p44 + a52 * p45
         y25 = p25 + a42 * p45 + a52 * p55
-        h0, h1 = weights[0] + lanes[BARRIER_VX, i - 1], lanes[BARRIER_VY, i - 1]
-        h5 = lanes[BARRIER_CROSS, i - 1]
+        h0, h1 = weights[0] + lanes[L.BARRIER_VX, i - 1], lanes[L.BARRIER_VY, i - 1]
+        h5 = lanes[L.BARRIER_CROSS, i - 1]
         ka0, ka1, ka2, ka3, ka4, ka5 = ka
         kd0, kd1, kd2, kd3, kd4, kd5 = kd
         # P = Hx + A' P A - G' M^-1 G + k c c'.
@@ -217,8 +176,8 @@ def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> Non
         p44 = _entry(p44 + weights[2], k, c4, c4, qa4, ka4, qd4, kd4)
         p45 = _entry(p45, k, c4, c5, qa4, ka5, qd4, kd5)
         p55 = _entry(p55 + weights[3], k, c5, c5, qa5, ka5, qd5, kd5)
-        # T = K' W, U = W M^-1 (M - W), which loses no digits where W is large.
-        ta, td = scaled(taken(e, GAIN_A), wa), scaled(taken(e, GAIN_DELTA), wd)
+        # T = K' W, U = W M^-1 (M - W): no cancellation where W is large.
+        ta, td = scaled(taken(e, L.GAIN_A), wa), scaled(taken(e, L.GAIN_DELTA), wd)
         uaa = wa * (iaa * haa + iad * had + kfa * fa * wa)
         uad = wa * (iaa * had + iad * hdd + kfa * fd * wd)
         udd = wd * (iad * had + idd * hdd + kfd * fd * wd)
@@ -226,7 +185,7 @@ def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> Non
 
 @compiled_internal
 def _along(e: Array, at: int, s: Six) -> Float:
-    """Inner product of six numbers of a stage, from `at` on, with s."""
+    """Inner product of six entries of a stage, from `at` on, with s."""
     return (
         e[at] * s[0] + e[at + 1] * s[1] + e[at + 2] * s[2] + e[at + 3] * s[3] + e[at + 4] * s[4]
         + e[at + 5] * s[5]
@@ -243,65 +202,66 @@ def moved(e: Array, k: int, dvx: Float, dvy: Float, dr: Float, da: Float, ddelta
 def _turned(
     e: Array, k: int, turn: Float, dvx: Float, dvy: Float, dr: Float, da: Float, ddelta: Float
 ) -> Float:
-    """`moved` with a change by the heading of `turn`."""
+    """`moved` plus the change `turn` by the heading."""
     return e[k] * dvx + e[6 + k] * dvy + e[12 + k] * dr + turn + e[20 + k] * da + e[26 + k] * ddelta
 
 
 @compiled_internal
 def solve(stages: Array, lanes: Array, weights: Array, constants: Array) -> None:
-    """Fill the stages' step from their gains, their solution so far and the slope.
-
-    The damping pulls to the plan.
-    """
+    """Fill the stages' step from gains, solution and slope; the damping pulls to the plan."""
     n = lanes.shape[1]
-    damping_a, damping_delta = constants[DAMPING_A], constants[DAMPING_DELTA]
+    damping_a, damping_delta = constants[L.DAMPING_A], constants[L.DAMPING_DELTA]
     e = stages[n]
-    s0 = weights[4] * (e[NOW_VX] - e[REFERENCE]) + lanes[SLOPE_VX, n - 1]
-    s1, s2 = lanes[SLOPE_VY, n - 1], weights[5] * (e[NOW_PSI] - e[REFERENCE_HEADING])
-    s3, s4 = 0.0, weights[6] * (e[NOW_X] - e[REFERENCE_X])
-    s5 = weights[7] * (e[NOW_Y] - e[REFERENCE_Y])
+    s0 = weights[4] * (e[L.NOW_VX] - e[L.REFERENCE]) + lanes[L.SLOPE_VX, n - 1]
+    s1, s2 = lanes[L.SLOPE_VY, n - 1], weights[5] * (e[L.NOW_PSI] - e[L.REFERENCE_HEADING])
+    s3, s4 = 0.0, weights[6] * (e[L.NOW_X] - e[L.REFERENCE_X])
+    s5 = weights[7] * (e[L.NOW_Y] - e[L.REFERENCE_Y])
     ta = td = 0.0
     for i in range(n - 1, -1, -1):
         e = stages[i]
-        a, delta, along = e[NOW_A], e[NOW_DELTA], lanes[SLOPE_RATE, i]
-        change_a, change_delta = lanes[SLOPE_CHANGE_A, i], lanes[SLOPE_CHANGE_DELTA, i]
+        a, delta, along = e[L.NOW_A], e[L.NOW_DELTA], lanes[L.SLOPE_RATE, i]
+        change_a, change_delta = lanes[L.SLOPE_CHANGE_A, i], lanes[L.SLOPE_CHANGE_DELTA, i]
         s = (s0, s1, s2, s3, s4, s5)
-        ma = weights[8] * a + damping_a * (a - e[PLAN_A]) + along + lanes[SLOPE_A, i]
+        ma = weights[8] * a + damping_a * (a - e[L.PLAN_A]) + along + lanes[L.SLOPE_A, i]
         ma = ma + change_a + ta + _along(e, 20, s)
-        md = weights[9] * delta + damping_delta * (delta - e[PLAN_DELTA])
-        md += along * e[RATE_DELTA] + lanes[SLOPE_DELTA, i] + change_delta + td
+        md = weights[9] * delta + damping_delta * (delta - e[L.PLAN_DELTA])
+        md += along * e[RATE_DELTA] + lanes[L.SLOPE_DELTA, i] + change_delta + td
         md += _along(e, 26, s)
-        ka = e[INVERSE_AA] * ma + e[INVERSE_AD] * md
-        kd = e[INVERSE_AD] * ma + e[INVERSE_DD] * md
-        e[STEP_A], e[STEP_DELTA] = ka, kd
-        ta, td = e[HOLD_A] * ka - change_a, e[HOLD_DELTA] * kd - change_delta
+        ka = e[L.INVERSE_AA] * ma + e[L.INVERSE_AD] * md
+        kd = e[L.INVERSE_AD] * ma + e[L.INVERSE_DD] * md
+        e[L.STEP_A], e[L.STEP_DELTA] = ka, kd
+        ta, td = e[L.HOLD_A] * ka - change_a, e[L.HOLD_DELTA] * kd - change_delta
         if i == 0:
             break
-        f0 = _along(e, 0, s) + weights[0] * (e[NOW_VX] - e[REFERENCE]) + lanes[SLOPE_VX, i - 1]
-        f1 = _along(e, 6, s) + lanes[SLOPE_VY, i - 1] + along * e[RATE_VY]
+        f0 = _along(e, 0, s) + weights[0] * (e[L.NOW_VX] - e[L.REFERENCE])
+        f0 += lanes[L.SLOPE_VX, i - 1]
+        f1 = _along(e, 6, s) + lanes[L.SLOPE_VY, i - 1] + along * e[RATE_VY]
         f2 = s2 + e[HEADING_X] * s4 + e[HEADING_Y] * s5
-        f2 += weights[1] * (e[NOW_PSI] - e[REFERENCE_HEADING])
-        s3 = _along(e, 12, s) + along * e[RATE_R] - e[GAIN_A + 3] * ma - e[GAIN_DELTA + 3] * md
-        s0 = f0 + along * e[RATE_VX] - (e[GAIN_A] * ma + e[GAIN_DELTA] * md)
-        s1 = f1 - e[GAIN_A + 1] * ma - e[GAIN_DELTA + 1] * md
-        s2 = f2 - e[GAIN_A + 2] * ma - e[GAIN_DELTA + 2] * md
-        s4 += weights[2] * (e[NOW_X] - e[REFERENCE_X]) - e[GAIN_A + 4] * ma - e[GAIN_DELTA + 4] * md
-        s5 += weights[3] * (e[NOW_Y] - e[REFERENCE_Y]) - e[GAIN_A + 5] * ma - e[GAIN_DELTA + 5] * md
+        f2 += weights[1] * (e[L.NOW_PSI] - e[L.REFERENCE_HEADING])
+        s3 = _along(e, 12, s) + along * e[RATE_R] - e[L.GAIN_A + 3] * ma - e[L.GAIN_DELTA + 3] * md
+        s0 = f0 + along * e[RATE_VX] - (e[L.GAIN_A] * ma + e[L.GAIN_DELTA] * md)
+        s1 = f1 - e[L.GAIN_A + 1] * ma - e[L.GAIN_DELTA + 1] * md
+        s2 = f2 - e[L.GAIN_A + 2] * ma - e[L.GAIN_DELTA + 2] * md
+        f4 = weights[2] * (e[L.NOW_X] - e[L.REFERENCE_X])
+        f5 = weights[3] * (e[L.NOW_Y] - e[L.REFERENCE_Y])
+        s4 += f4 - e[L.GAIN_A + 4] * ma - e[L.GAIN_DELTA + 4] * md
+        s5 += f5 - e[L.GAIN_A + 5] * ma - e[L.GAIN_DELTA + 5] * md
     x0 = x1 = x2 = x3 = x4 = x5 = 0.0
     pa = pd = 0.0
     e = stages[0]
-    e[STEP_VX] = e[STEP_VY] = e[STEP_PSI] = e[STEP_R] = e[STEP_X] = e[STEP_Y] = 0.0
+    e[L.STEP_VX] = e[L.STEP_VY] = e[L.STEP_PSI] = e[L.STEP_R] = e[L.STEP_X] = e[L.STEP_Y] = 0.0
     for i in range(n):
         e, f = stages[i], stages[i + 1]
         x = (x0, x1, x2, x3, x4, x5)
-        ua = e[CARRY] * pa + e[CARRY + 1] * pd - e[STEP_A] - _along(e, GAIN_A, x)
-        ud = e[CARRY + 2] * pa + e[CARRY + 3] * pd - e[STEP_DELTA] - _along(e, GAIN_DELTA, x)
+        ua = e[L.CARRY] * pa + e[L.CARRY + 1] * pd - e[L.STEP_A] - _along(e, L.GAIN_A, x)
+        ud = e[L.CARRY + 2] * pa + e[L.CARRY + 3] * pd - e[L.STEP_DELTA]
+        ud -= _along(e, L.GAIN_DELTA, x)
         x4 += _turned(e, 4, e[HEADING_X] * x2, x0, x1, x3, ua, ud)
         x5 += _turned(e, 5, e[HEADING_Y] * x2, x0, x1, x3, ua, ud)
         x2 += moved(e, 2, x0, x1, x3, ua, ud)
         y0, y1 = moved(e, 0, x0, x1, x3, ua, ud), moved(e, 1, x0, x1, x3, ua, ud)
         x3 = moved(e, 3, x0, x1, x3, ua, ud)
         x0, x1, pa, pd = y0, y1, ua, ud
-        e[STEP_A], e[STEP_DELTA] = ua, ud
-        f[STEP_VX], f[STEP_VY], f[STEP_PSI] = x0, x1, x2
-        f[STEP_R], f[STEP_X], f[STEP_Y] = x3, x4, x5
+        e[L.STEP_A], e[L.STEP_DELTA] = ua, ud
+        f[L.STEP_VX], f[L.STEP_VY], f[L.STEP_PSI] = x0, x1, x2
+        f[L.STEP_R], f[L.STEP_X], f[L.STEP_Y] = x3, x4, x5

@@ -1,50 +1,19 @@
-"""The NMPC's real-time iteration, compiled: one linearisation and one program a control period.
+"""Real-time iteration of the NMPC, compiled: one linearisation and one QP per control period.
 
-`solve` is the solver for one vehicle; `control` is the agent's step for rows of observations.
+`solve` solves the problem of one vehicle; `control` computes actions for rows of observations.
 Diehl, Bock and Schloeder, "A real-time iteration scheme for nonlinear optimization in optimal
-feedback control", SIAM J. Control Optim. 43, 2005; the plan is rolled out from the state as
-measured, so it is feasible for the dynamics before every program.
+feedback control", SIAM J. Control Optim. 43, 2005. The plan is rolled out from the measured state,
+so it satisfies the dynamics before every QP.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc.layout import (
-    HIGH_A,
-    LINEAR,
-    LOW_A,
-    MAX_DELTA,
-    NOW_A,
-    NOW_DELTA,
-    NOW_PSI,
-    NOW_VX,
-    NOW_X,
-    NOW_Y,
-    PERIOD,
-    PLAN_A,
-    PLAN_DELTA,
-    PLAN_PSI,
-    PLAN_R,
-    PLAN_VX,
-    PLAN_VY,
-    PLAN_X,
-    PLAN_Y,
-    QUADRATIC,
-    REFERENCE,
-    REFERENCE_HEADING,
-    REFERENCE_X,
-    REFERENCE_Y,
-    SHIFT,
-    SLACKS,
-    SPACE_HIGH_A,
-    SPACE_HIGH_DELTA,
-    SPACE_LOW_A,
-    SPACE_LOW_DELTA,
-)
+from agents.nmpc import layout as L
 from agents.nmpc.linearisation import differentiate
 from agents.nmpc.qp import (
     CODE,
@@ -53,13 +22,13 @@ from agents.nmpc.qp import (
     NOT_FINITE,
     OUTER,
     SLACK,
+    STATS,
     SUCCESS,
-    TOLD,
     clamp,
-    solve_program,
+    solve_qp,
 )
 from agents.reference import NODE, fill_nodes
-from lpv_track_env.observation import PREVIEW_START
+from lpv_track_env import observation as entry
 from trajectories.compilation import (
     compiled,
     compiled_in_place,
@@ -70,90 +39,116 @@ from trajectories.compilation import (
 Array = NDArray[Any]
 Float = Any
 
-WARM, PLANNED, AGE, FAILURES = range(4)
-"""Flags of a row, (FLAGS,): whether its plan warm-starts, is there at all, its age, failures."""
+# Flags of a vehicle, (FLAGS,).
+(
+    WARM,  # 1 if the last plan warm-starts the next solve
+    PLANNED,  # 1 if there is a plan
+    AGE,  # control periods since it was made
+    FAILURES,  # failed solves in a row
+) = range(4)
 FLAGS = 4
+
+
+class NmpcArrays(NamedTuple):
+    """Constants of an NMPC and its memory of n vehicles, for compiled code."""
+
+    constants: Array
+    """(CONSTANTS_SIZE,), see `layout`."""
+    plans: Array
+    """Inputs of the last plans, (n, N, 2)."""
+    flags: Array
+    """(n, FLAGS) int64."""
+    stats: Array
+    """Statistics of the last solves, (n, STATS), see `qp`."""
+    states: Array
+    """States of the last plans, (n, N + 1, 6)."""
+    actions: Array
+    """Last actions, (n, 2)."""
 
 
 @compiled_internal
 def cost_of(stages: Array, lanes: Array, at: int, weights: Array, constants: Array) -> Float:
-    """Cost of the problem at a point of the stages (from column `at` on) and the slacks."""
+    """Cost of the problem for a point of the stages (from column `at` on) and the slacks."""
     n = lanes.shape[1]
     vx, psi, x, y = (
-        at + NOW_VX - NOW_A,
-        at + NOW_PSI - NOW_A,
-        at + NOW_X - NOW_A,
-        at + NOW_Y - NOW_A,
+        at + L.NOW_VX - L.NOW_A,
+        at + L.NOW_PSI - L.NOW_A,
+        at + L.NOW_X - L.NOW_A,
+        at + L.NOW_Y - L.NOW_A,
     )
     total = 0.0
     for i in range(n + 1):
         offset, e = 4 if i == n else 0, stages[i]
-        e0, e1 = e[vx] - e[REFERENCE], e[psi] - e[REFERENCE_HEADING]
-        e2, e3 = e[x] - e[REFERENCE_X], e[y] - e[REFERENCE_Y]
+        e0, e1 = e[vx] - e[L.REFERENCE], e[psi] - e[L.REFERENCE_HEADING]
+        e2, e3 = e[x] - e[L.REFERENCE_X], e[y] - e[L.REFERENCE_Y]
         total += weights[offset] * e0 * e0 + weights[offset + 1] * e1 * e1
         total += weights[offset + 2] * e2 * e2 + weights[offset + 3] * e3 * e3
     for i in range(n):
         a, delta = stages[i, at], stages[i, at + 1]
         total += weights[8] * a * a + weights[9] * delta * delta
         for soft in range(3):
-            s = lanes[SLACKS[soft], i]
-            total += s * (2.0 * constants[LINEAR + soft] + constants[QUADRATIC + soft] * s)
+            s = lanes[L.SLACKS[soft], i]
+            total += s * (2.0 * constants[L.LINEAR + soft] + constants[L.QUADRATIC + soft] * s)
     return 0.5 * total
 
 
 @compiled_in_place
 def solve(
     stages: Array, lanes: Array, last_a: Float, last_delta: Float, weights: Array,
-    constants: Array, told: Array,
+    constants: Array, stats: Array,
 ) -> int:  # fmt: skip
-    """One real-time iteration on the plan, its first state and the reference in `stages`.
+    """Do one real-time iteration on the plan, its first state and the reference in `stages`.
 
-    (last_a, last_delta) is the input in force, weights (10,). The improved plan is the stages' NOW;
-    fills `told` (TOLD,). Returns the code; on any but SUCCESS there is nothing to be used.
+    (last_a, last_delta) is the input in force, weights (10,). Writes the improved plan to the
+    stages' NOW, fills the statistics `stats` (STATS,) and returns a code; only with SUCCESS is the
+    plan valid.
     """
-    told[INNER] = told[OUTER] = 0.0
-    clamp(stages, PLAN_A, last_a, last_delta, constants)
+    stats[INNER] = stats[OUTER] = 0.0
+    clamp(stages, L.PLAN_A, last_a, last_delta, constants)
     for i in range(lanes.shape[1]):
         differentiate(stages[i], constants, stages[i + 1])
-    code = solve_program(stages, lanes, last_a, last_delta, weights, constants, told)
-    told[COST] = cost_of(stages, lanes, NOW_A, weights, constants) if code == SUCCESS else math.nan
+    code = solve_qp(stages, lanes, last_a, last_delta, weights, constants, stats)
+    stats[COST] = math.nan
+    if code == SUCCESS:
+        stats[COST] = cost_of(stages, lanes, L.NOW_A, weights, constants)
     for soft in range(3):
         largest = 0.0
         if code == SUCCESS:
             for i in range(lanes.shape[1]):
-                largest = max(largest, lanes[SLACKS[soft], i])
-        told[SLACK + soft] = largest
+                largest = max(largest, lanes[L.SLACKS[soft], i])
+        stats[SLACK + soft] = largest
     return code
 
 
 @compiled_internal
-def situate(observation: Array, constants: Array, stages: Array) -> bool:
-    """Take an observation apart: first state and reference, in the foot point's frame.
+def load_observation(observation: Array, constants: Array, stages: Array) -> bool:
+    """Write first state and reference to the stages, in the frame of the path's foot point.
 
-    Returns whether the observation is finite; only then it does.
+    Returns False, and writes nothing, if the observation is not finite.
     """
     total = 0.0
     for k in range(observation.shape[0]):
         total += abs(observation[k])
     if not math.isfinite(total):
         return False
-    e = stages[0]
-    e[PLAN_VX], e[PLAN_VY], e[PLAN_PSI] = observation[0], observation[1], observation[6]
-    e[PLAN_R], e[PLAN_X], e[PLAN_Y] = observation[2], 0.0, observation[5]
-    steps = (observation.shape[0] - PREVIEW_START) // 2
+    e, o = stages[0], observation
+    e[L.PLAN_VX], e[L.PLAN_VY] = o[entry.LONGITUDINAL_SPEED], o[entry.LATERAL_SPEED]
+    e[L.PLAN_PSI], e[L.PLAN_R] = o[entry.HEADING_ERROR], o[entry.YAW_RATE]
+    e[L.PLAN_X], e[L.PLAN_Y] = 0.0, o[entry.LATERAL_ERROR]
+    first = entry.PREVIEW_START
+    speeds = first + (o.shape[0] - first) // 2
     fill_nodes(
-        observation[PREVIEW_START : PREVIEW_START + steps], observation[7],
-        observation[PREVIEW_START + steps :], constants[PERIOD],
-        stages[:, REFERENCE : REFERENCE + NODE],
+        o[first:speeds], o[entry.REFERENCE_SPEED], o[speeds:], constants[L.PERIOD],
+        stages[:, L.REFERENCE : L.REFERENCE + NODE],
     )  # fmt: skip
     return True
 
 
 @compiled
 def bound_action(a: Float, delta: Float, constants: Array, action: Array) -> None:
-    """Write an action as it is handed out: of float32's precision, within the action space."""
-    low_a, low_delta = constants[SPACE_LOW_A], constants[SPACE_LOW_DELTA]
-    high_a, high_delta = constants[SPACE_HIGH_A], constants[SPACE_HIGH_DELTA]
+    """Write an action, rounded to float32 and clipped to the action space."""
+    low_a, low_delta = constants[L.SPACE_LOW_A], constants[L.SPACE_LOW_DELTA]
+    high_a, high_delta = constants[L.SPACE_HIGH_A], constants[L.SPACE_HIGH_DELTA]
     action[0] = min(max(float(np.float32(a)), low_a), high_a)
     action[1] = min(max(float(np.float32(delta)), low_delta), high_delta)
 
@@ -161,38 +156,39 @@ def bound_action(a: Float, delta: Float, constants: Array, action: Array) -> Non
 @compiled
 def control(
     first: int, observations: Array, weights: Array, constants: Array, plans: Array, flags: Array,
-    told: Array, states: Array, actions: Array, stages: Array, lanes: Array,
+    stats: Array, states: Array, actions: Array, stages: Array, lanes: Array,
 ) -> int:  # fmt: skip
     """Control some vehicles: fill their rows of `actions` (n, 2); returns how many solves failed.
 
-    Observations (m, size) are of rows first to first + m - 1 of all n. `weights` is (n, 10), or
-    (1, 10) for all; `plans` (n, N, 2), `flags` (n, FLAGS), `told` (n, TOLD) and `states`
-    (n, N + 1, 6) are what is remembered. After a failure the last plan stands, a period older, and
-    no longer warm-starts. `stages` and `lanes` are working space.
+    Observations (m, size) are those of rows first to first + m - 1 of all n. `weights` is (n, 10),
+    or (1, 10) for all. `constants` to `actions` are those of `NmpcArrays`; they are passed one by
+    one because this is called from Python every control period. After a failure the last plan
+    stays, a period older, and no longer warm-starts. `stages` and `lanes` are working space.
     """
     n, failed = lanes.shape[1], 0
     for j in range(observations.shape[0]):
         row = first + j
         code = NOT_FINITE
-        for k in range(TOLD):
-            told[row, k] = 0.0
-        told[row, COST] = math.nan
-        if situate(observations[j], constants, stages):
-            last_a = min(max(observations[j, 3], constants[LOW_A]), constants[HIGH_A])
-            last_delta = observations[j, 4]
-            last_delta = min(max(last_delta, -constants[MAX_DELTA]), constants[MAX_DELTA])
+        for k in range(STATS):
+            stats[row, k] = 0.0
+        stats[row, COST] = math.nan
+        if load_observation(observations[j], constants, stages):
+            last_a = observations[j, entry.ACCELERATION]
+            last_a = min(max(last_a, constants[L.LOW_A]), constants[L.HIGH_A])
+            last_delta = observations[j, entry.STEERING_ANGLE]
+            last_delta = min(max(last_delta, -constants[L.MAX_DELTA]), constants[L.MAX_DELTA])
             for i in range(n):
                 a, delta = last_a, last_delta
                 if flags[row, WARM] > 0:
-                    # A share of a period on in time; the last input is held.
+                    # Shift the plan by the share of its period that has passed; hold its end.
                     ahead = min(i + 1, n - 1)
                     a, delta = plans[row, i, 0], plans[row, i, 1]
-                    a += constants[SHIFT] * (plans[row, ahead, 0] - a)
-                    delta += constants[SHIFT] * (plans[row, ahead, 1] - delta)
-                stages[i, PLAN_A], stages[i, PLAN_DELTA] = a, delta
+                    a += constants[L.SHIFT] * (plans[row, ahead, 0] - a)
+                    delta += constants[L.SHIFT] * (plans[row, ahead, 1] - delta)
+                stages[i, L.PLAN_A], stages[i, L.PLAN_DELTA] = a, delta
             own = row if weights.shape[0] > 1 else 0
-            code = solve(stages, lanes, last_a, last_delta, weights[own], constants, told[row])
-        told[row, CODE] = code
+            code = solve(stages, lanes, last_a, last_delta, weights[own], constants, stats[row])
+        stats[row, CODE] = code
         if code != SUCCESS:
             flags[row, WARM] = 0
             flags[row, AGE] += 1
@@ -200,27 +196,27 @@ def control(
             failed += 1
             continue
         for i in range(n):
-            plans[row, i, 0], plans[row, i, 1] = stages[i, NOW_A], stages[i, NOW_DELTA]
+            plans[row, i, 0], plans[row, i, 1] = stages[i, L.NOW_A], stages[i, L.NOW_DELTA]
         for i in range(n + 1):
             for k in range(6):
-                states[row, i, k] = stages[i, NOW_VX + k]
+                states[row, i, k] = stages[i, L.NOW_VX + k]
         flags[row, WARM], flags[row, PLANNED] = 1, 1
         flags[row, AGE], flags[row, FAILURES] = 0, 0
-        bound_action(stages[0, NOW_A], stages[0, NOW_DELTA], constants, actions[row])
+        bound_action(stages[0, L.NOW_A], stages[0, L.NOW_DELTA], constants, actions[row])
     return failed
 
 
 @compiled_parallel
 def control_in_threads(
     chunks: int, observations: Array, weights: Array, constants: Array, plans: Array,
-    flags: Array, told: Array, states: Array, actions: Array, stages: Array, lanes: Array,
+    flags: Array, stats: Array, states: Array, actions: Array, stages: Array, lanes: Array,
     failed: Array,
 ) -> None:  # fmt: skip
-    """`control` of all rows, in chunks that threads share; `failed` (chunks,) gets its results."""
+    """`control` for all rows, in chunks that threads share; fills `failed` (chunks,)."""
     n = observations.shape[0]
     for chunk in numba.prange(chunks):
         first, last = chunk * n // chunks, (chunk + 1) * n // chunks
         failed[chunk] = control(
-            first, observations[first:last], weights, constants, plans, flags, told, states,
+            first, observations[first:last], weights, constants, plans, flags, stats, states,
             actions, stages[chunk], lanes[chunk],
         )  # fmt: skip

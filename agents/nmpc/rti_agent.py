@@ -1,50 +1,46 @@
-"""The LPV-NMPC as an agent in real time: `lpv-nmpc`."""
+"""The LPV-NMPC in real time: the agent `lpv-nmpc`."""
 
 import copy
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Action, DrivingTask, observation_rows
-from agents.nmpc import layout, rti
-from agents.nmpc import qp as program
-from agents.nmpc.base import Ladder, NmpcAgent
-from agents.nmpc.problem import INPUTS, STATES
+from agents.nmpc import layout, qp, rti
+from agents.nmpc.base import Fallback, NmpcAgent
+from agents.nmpc.problem import INPUTS, STATES, Status
 from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
 from agents.nmpc.schedule import NO_BAND, WEIGHTS
-from agents.weights import TrackingWeights, WeightSchedule
+from agents.nmpc.settings import NmpcSettings, passes_settings
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.validation import checked_threads
 from lpv_track_env.vector_kernels import shares, using_threads
-from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]
 
 
 class RtiMemory:
-    """What the real-time NMPC remembers of n vehicles: arrays for compiled code, a row a vehicle.
+    """Memory of n vehicles of the real-time NMPC: arrays for compiled code, a row a vehicle.
 
-    `plans` (n, N, 2), `flags` (n, FLAGS), `told` (n, TOLD), `states` (n, N + 1, 6) as `rti` has
-    them; `actions` (n, 2) of the last step; `bands` (n,) and `weights` (n, 10) in use where a
-    schedule chooses, as `switching` has them.
+    `plans`, `flags`, `stats`, `states` and `actions` are those of `rti.NmpcArrays`; with a
+    schedule, `bands` (n,) and `weights` (n, 10) are the bands and weights in use.
     """
 
     def __init__(self, rows: int, horizon: int) -> None:
         self.plans = np.zeros((rows, horizon, INPUTS))
         self.flags = np.zeros((rows, rti.FLAGS), dtype=np.int64)
-        self.told = np.zeros((rows, program.TOLD))
+        self.stats = np.zeros((rows, qp.STATS))
         self.states = np.zeros((rows, horizon + 1, STATES))
         self.actions = np.zeros((rows, INPUTS))
         self.bands = np.full(rows, NO_BAND)
         self.weights = np.zeros((rows, WEIGHTS))
-        self.ladders: dict[int, Ladder] = {}
-        """Of rows in which a solve has failed in this episode."""
+        self.fallbacks: dict[int, Fallback] = {}
+        """Fallbacks of the rows in which a solve has failed in this episode."""
         self.seconds = 0.0
-        """Time of the last step's solves, s, all rows together."""
+        """Time of the last step's solves, s, of all rows together."""
 
     def __len__(self) -> int:
         return len(self.plans)
@@ -54,31 +50,36 @@ class RtiMemory:
             raise IndexError(f"row {row} of {len(self)}")
         return RtiRow(self, row % len(self))
 
+    @property
+    def arrays(self) -> tuple[Any, Any, Any, Any, Any]:
+        """Plans, flags, statistics, states and actions, as in `rti.NmpcArrays`; not copies."""
+        return self.plans, self.flags, self.stats, self.states, self.actions
+
     def take(self, row: int) -> "RtiMemory":
-        """Memory of one row alone, on the same arrays; `put` gives the rest of it back."""
+        """Return the memory of one row, as views of the same arrays; `put` puts it back."""
         alone = copy.copy(self)
-        for name in ("plans", "flags", "told", "states", "actions", "bands", "weights"):
+        for name in ("plans", "flags", "stats", "states", "actions", "bands", "weights"):
             setattr(alone, name, getattr(self, name)[row : row + 1])
-        alone.ladders = {0: self.ladders[row]} if row in self.ladders else {}
+        alone.fallbacks = {0: self.fallbacks[row]} if row in self.fallbacks else {}
         return alone
 
     def put(self, row: int, alone: "RtiMemory") -> None:
-        """Take back a row that was given out by `take`."""
-        if 0 in alone.ladders:
-            self.ladders[row] = alone.ladders[0]
+        """Put a row that `take` returned back."""
+        if 0 in alone.fallbacks:
+            self.fallbacks[row] = alone.fallbacks[0]
         self.seconds = alone.seconds * len(self)
 
     def clear(self, row: int) -> None:
-        """Forget a row: a new episode begins there."""
+        """Clear a row: a new episode begins there."""
         self.flags[row] = 0
         self.bands[row] = NO_BAND
         self.weights[row] = 0.0
-        self.ladders.pop(row, None)
+        self.fallbacks.pop(row, None)
 
 
 @dataclass(frozen=True)
 class RtiRow:
-    """One vehicle's part of an `RtiMemory`."""
+    """One vehicle's row of an `RtiMemory`."""
 
     memory: RtiMemory
     row: int
@@ -87,32 +88,21 @@ class RtiRow:
 class RtiNmpc(NmpcAgent[RtiRow]):
     """The LPV-NMPC of kumar2025lpv by real-time iterations: microseconds a solve.
 
-    The public behaviour is that of `lpv-nmpc-ipopt`, its ladder after failed solves included. A
-    batch of observations (n, size) is solved in one compiled call.
+    It behaves like `lpv-nmpc-ipopt`, also after failed solves. A batch of observations (n, size) is
+    solved in one compiled call.
 
     Parameters
     ----------
     task
-        What is driven.
-    horizon
-        N, at most the observation's preview steps (the default).
-    weights
-        Fixed weights, or a schedule, or the file of one.
-    selection
-        How a schedule chooses: "band" from the sharpest curvature in the preview at every step, or
-        "path" once from the path's sharpest curvature, the paper's rule.
-    model
-        The prediction model and its constraints, by default the task's own vehicle.
-    linear_penalty, quadratic_penalty
-        Prices of slack on (vx, vy, vx'), see `NmpcProblem`.
+        Task of the agent.
     damping
         Levenberg term on (a, delta), see `RtiSolver`.
     tolerance
-        Of the quadratic program.
-    max_failures
-        Failed solves in a row after which the vehicle is brought to a stop.
+        Tolerance of the QP.
     threads
         Threads that share a batch of observations, 1 by default. Results do not depend on it.
+    **settings
+        Settings of all NMPC agents, see `NmpcSettings`.
 
     Raises
     ------
@@ -120,31 +110,17 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         If the horizon is longer than the preview, or a setting is out of range.
     """
 
+    @passes_settings(NmpcSettings)
     def __init__(
         self,
         task: DrivingTask,
         *,
-        horizon: int | None = None,
-        weights: TrackingWeights | WeightSchedule | str | Path | None = None,
-        selection: str = "band",
-        model: VehicleParameters | None = None,
-        linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),
-        quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0),
         damping: tuple[float, float] = DAMPING,
         tolerance: float = 1e-12,
-        max_failures: int = 10,
         threads: int = 1,
+        **settings: Any,
     ) -> None:
-        super().__init__(
-            task,
-            horizon=horizon,
-            weights=weights,
-            selection=selection,
-            model=model,
-            linear_penalty=linear_penalty,
-            quadratic_penalty=quadratic_penalty,
-            max_failures=max_failures,
-        )
+        super().__init__(task, NmpcSettings(**settings))
         self.solver = RtiSolver(self.problem, damping=damping, tolerance=tolerance)
         space = slice(layout.SPACE_LOW_A, layout.SPACE_HIGH_DELTA + 1)
         self.solver.constants[space] = [*self._low, *self._high]
@@ -152,13 +128,13 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         self._work = layout.working_space(self.problem.horizon, shares(self._threads))
         self._memory: RtiMemory | None = None
         self._size = task.layout.size
-        # Of no rows: so it compiles here, if need be, and not within the first control period.
+        # Called with zero rows to trigger compilation here, not in the first control period.
         memory, none = self._new(0), np.zeros((0, self._size))
         self.switching.choose(none, self.problem.horizon, memory.bands, memory.weights)
         self.solve_rows(none, self.fixed_weights, memory)
 
     def control(self, observation: TrackingObservation, memory: RtiRow) -> tuple[float, float]:
-        """Inputs for one observation, those of `predict`; what it remembers is that row's."""
+        """Compute inputs for one observation as `predict` does, with the memory of its row."""
         flat = np.concatenate([np.ravel(entry) for entry in observation])
         alone = memory.memory.take(memory.row)
         action, _ = self.predict(flat, alone)
@@ -166,14 +142,14 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         return float(action[0]), float(action[1])
 
     def new_memory(self) -> RtiRow:
-        """Nothing solved yet, for one vehicle."""
+        """Create the memory of one vehicle, without a plan."""
         return RtiRow(self._new(1), 0)
 
     def _new(self, rows: int) -> RtiMemory:
         return RtiMemory(rows, self.problem.horizon)
 
     def reset(self) -> None:
-        """Forget everything: the next call begins new episodes."""
+        """Clear the memory: the next call begins new episodes."""
         self._memory = None
 
     def predict(  # type: ignore[override]
@@ -183,7 +159,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,  # noqa: ARG002  part of the protocol
     ) -> tuple[Action, RtiMemory]:
-        """Action (2,) for one observation (size,), or (n, 2) for a batch; and the memory.
+        """Return the action (2,) for an observation (size,), or (n, 2) for a batch; and the memory.
 
         Raises
         ------
@@ -208,23 +184,19 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         began = time.perf_counter()
         failed = self.solve_rows(rows, weights, memory)
         memory.seconds = time.perf_counter() - began
-        if memory.ladders or failed:
-            self.replace_failed(
-                rows, memory, np.flatnonzero(memory.told[:, program.CODE] != program.SUCCESS)
-            )
+        if memory.fallbacks or failed:
+            failures = np.flatnonzero(memory.stats[:, qp.CODE] != qp.SUCCESS)
+            self.replace_failed(rows, memory, failures)
         actions = memory.actions.astype(np.float32)
         return (actions[0] if np.ndim(observation) == 1 else actions), memory
 
     def solve_rows(self, rows: Array, weights: Array, memory: RtiMemory) -> int:
-        """Solve for every row of observations (n, size), `weights` (n or 1, 10), into `memory`.
+        """Solve for every row of observations (n, size), with weights (n or 1, 10), into `memory`.
 
-        How many solves failed; their rows keep the action of the last step.
+        Returns the number of failed solves; their rows keep the action of the last step.
         """
         stages, lanes = self._work
-        arguments = (
-            rows, weights, self.solver.constants, memory.plans, memory.flags, memory.told,
-            memory.states, memory.actions,
-        )  # fmt: skip
+        arguments = (rows, weights, self.solver.constants, *memory.arrays)
         chunks = min(len(stages), len(rows))
         if chunks <= 1:
             return rti.control(0, *arguments, stages[0], lanes[0])
@@ -234,16 +206,16 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         return int(failed.sum())
 
     def replace_failed(self, rows: Array, memory: RtiMemory, failed: NDArray[np.intp]) -> None:
-        """Put what the ladder says in place of the actions of `failed` rows' solves."""
-        for ladder in memory.ladders.values():
-            ladder.fallback = ""
+        """Replace the actions of the rows whose solves have `failed` (m,) by their fallbacks."""
+        for fallback in memory.fallbacks.values():
+            fallback.used = ""
         for row in failed.tolist():
-            ladder = memory.ladders.setdefault(row, self.new_ladder())
+            fallback = memory.fallbacks.setdefault(row, self.new_fallback())
             _, planned, age, failures = memory.flags[row].tolist()
             action = self.replace(
                 self.task.layout.unpack(rows[row]),
-                ladder,
-                STATUS[int(memory.told[row, program.CODE])].value,
+                fallback,
+                STATUS[int(memory.stats[row, qp.CODE])].value,
                 memory.plans[row] if planned else None,
                 age,
                 failures,
@@ -252,25 +224,26 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             rti.bound_action(a, delta, self.solver.constants, memory.actions[row])
 
     def diagnostics(self, memory: RtiRow) -> dict[str, Any]:
-        """Last solve of one vehicle: status, seconds, iterations, cost, slack (3,), plan, weights.
+        """Describe the last solve of one vehicle.
 
-        `weights` (10,) are Q, S, R in use. `plan` (N + 1, 2) holds the predicted positions in the
-        frame of the path's foot point; `iterations` are those of the interior-point method;
-        `seconds` those of the whole batch, shared out evenly.
+        Its status, seconds, iterations, cost, slack (3,), fallback, plan and weights. `weights`
+        (10,) are Q, S, R in use; `plan` (N + 1, 2) holds the predicted positions in the frame of
+        the path's foot point; `iterations` counts those of the QP solver; `seconds` is the time of
+        the batch divided by its rows.
         """
         batch, row = memory.memory, memory.row
-        told = batch.told[row]
-        status = STATUS[int(told[program.CODE])]
-        solved = int(told[program.CODE]) == program.SUCCESS
+        stats = batch.stats[row]
+        status = STATUS[int(stats[qp.CODE])]
+        solved = status is Status.SUCCESS
         order = np.array(layout.SLACK_OF)
-        ladder = batch.ladders.get(row)
+        fallback = batch.fallbacks.get(row)
         return {
             "status": status.value,
             "seconds": batch.seconds / len(batch),
-            "iterations": int(told[program.INNER]),
-            "cost": float(told[program.COST]),
-            "slack": told[program.SLACK : program.SLACK + 3][order] if solved else None,
-            "fallback": "" if solved or ladder is None else ladder.fallback,
+            "iterations": int(stats[qp.INNER]),
+            "cost": float(stats[qp.COST]),
+            "slack": stats[qp.SLACK : qp.SLACK + 3][order] if solved else None,
+            "fallback": "" if solved or fallback is None else fallback.used,
             "plan": batch.states[row, :, 4:].copy() if solved else None,
             "weights": (batch.weights[row] if self.has_schedule else self.fixed_weights[0]).copy(),
         }

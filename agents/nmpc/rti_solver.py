@@ -1,34 +1,41 @@
-"""The fast solver of the NMPC's problem: a structured real-time iteration in compiled code."""
+"""Fast solver of the NMPC's problem, compiled: real-time iteration, or SQP to convergence."""
 
+import math
 import time
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc import layout, linearisation, rti, sqp
-from agents.nmpc import qp as program
+from agents.nmpc import layout as L
+from agents.nmpc import linearisation, qp, rti
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import STATES, NmpcProblem, Solution, Status
+from lpv_track_env.bicycle import compiled_field, compiled_inverse_speed
+from trajectories.compilation import compiled
 
 Array = NDArray[np.float64]
+Float = Any
 
 STATUS = {
-    program.SUCCESS: Status.SUCCESS,
-    program.MAXITER: Status.MAXITER,
-    program.NOT_FINITE: Status.NAN,
-    program.QP_FAILURE: Status.QP_FAILURE,
+    qp.SUCCESS: Status.SUCCESS,
+    qp.MAXITER: Status.MAXITER,
+    qp.NOT_FINITE: Status.NAN,
+    qp.QP_FAILURE: Status.QP_FAILURE,
 }
 DAMPING = (0.0, 0.0)
-"""Levenberg term on (a, delta), by default."""
+"""Default Levenberg term on (a, delta)."""
 
 
 def limits(problem: NmpcProblem, damping: tuple[float, float]) -> Array:
-    """The last of a solver's constants (`layout`): bounds, prices and damping."""
+    """Return the last of a solver's constants (`layout`): bounds, penalties and damping."""
     car = problem.vehicle
     first, steps = problem.input_steps[0], problem.input_steps[-1]
     if problem.horizon == 1:
         steps = first
-    order = np.array(layout.SLACK_OF)
+    order = np.array(L.SLACK_OF)
     return np.array(
         [
             *car.acceleration_range,
@@ -45,21 +52,141 @@ def limits(problem: NmpcProblem, damping: tuple[float, float]) -> Array:
     )
 
 
+STEP_TOLERANCE = 1e-11
+"""Change of the inputs below which the plan has converged."""
+SHORTEST = 1e-6
+"""Shortest step length that is tried."""
+DEPTH = 10
+"""Steps that Anderson acceleration combines."""
+PATIENCE = 8
+"""Steps in a row without progress beyond rounding, after which the iteration stops."""
+
+
+@compiled
+def roll_out_cost(stages: Array, lanes: Array, weights: Array, constants: Array) -> Float:
+    """Roll the inputs in the stages' STEP out, fill the slacks, and return the exact cost."""
+    p = constants
+    for k in range(2, L.POINT):
+        stages[0, L.STEP_A + k] = stages[0, L.PLAN_A + k]
+    for i in range(lanes.shape[1]):
+        e, end = stages[i], stages[i + 1]
+        a, delta = e[L.STEP_A], e[L.STEP_DELTA]
+        following = linearisation.advance(linearisation.taken(e, L.STEP_VX), a, delta, p)
+        for k in range(6):
+            end[L.STEP_VX + k] = following[k]
+        rate = compiled_field(
+            e[L.STEP_VX], e[L.STEP_VY], e[L.STEP_R], 1.0, 0.0, a, delta, math.cos(delta),
+            math.sin(delta), compiled_inverse_speed(e[L.STEP_VX]), p[0], p[1], p[2], p[3], p[4],
+            p[5], p[6],
+        )[0]  # fmt: skip
+        vx, vy = end[L.STEP_VX], end[L.STEP_VY]
+        lanes[L.SLACKS[0], i] = max(p[L.LOW_SPEED] - vx, vx - p[L.HIGH_SPEED], 0.0)
+        lanes[L.SLACKS[1], i] = max(p[L.LOW_RATE] - rate, rate - p[L.HIGH_RATE], 0.0)
+        lanes[L.SLACKS[2], i] = max(abs(vy) - p[L.RATIO] * vx, 0.0)
+    return rti.cost_of(stages, lanes, L.STEP_A, weights, constants)
+
+
+@compiled
+def clamp_step(stages: Array, last_a: Float, last_delta: Float, constants: Array) -> None:
+    """Clip the inputs in the stages' STEP to their bounds and rates."""
+    qp.clamp(stages, L.STEP_A, last_a, last_delta, constants)
+
+
+def converge(
+    plan: Array,
+    solve_qp: Callable[[Array], tuple[Status, Array]],
+    cost: Callable[[Array], float],
+    bound: Callable[[Array], Array],
+    iterations: int,
+) -> tuple[Status, Array, int]:
+    """Iterate a plan, inputs (N, 2) within their limits, until it no longer changes.
+
+    Iterates the map from a plan to the solution of its QP. Full Gauss-Newton steps can cycle, and
+    damped ones converge slowly where the residual is large. Steps are therefore combined by
+    Anderson acceleration (Walker and Ni, "Anderson acceleration for fixed-point iterations", SIAM
+    J. Numer. Anal. 49, 2011), accepted only if the exact cost decreases, and otherwise shortened
+    until it does.
+
+    Parameters
+    ----------
+    plan
+        Start.
+    solve_qp
+        Returns status and solution of the QP linearised along a plan.
+    cost
+        Returns the exact cost of a plan.
+    bound
+        Clips a plan to the limits of its inputs.
+    iterations
+        Largest number of QPs.
+
+    Returns
+    -------
+    status
+        SUCCESS, or the status of a QP that failed.
+    plan
+        The best plan found.
+    iterations
+        Number of QPs solved.
+    """
+    best = cost(plan)
+    plans: list[Array] = []
+    steps: list[Array] = []
+    idle = 0
+    for count in range(1, iterations + 1):
+        status, solution = solve_qp(plan)
+        if status is not Status.SUCCESS:
+            return status, plan, count
+        step = solution - plan
+        if np.abs(step).max() <= STEP_TOLERANCE:
+            return Status.SUCCESS, plan, count
+        plans, steps = [*plans, plan][-DEPTH:], [*steps, step][-DEPTH:]
+        before = best
+        if len(plans) > 1:
+            mixed = bound(_mixed(plans, steps))
+            found = cost(mixed)
+            if found < best:
+                plan, best = mixed, found
+        length = 1.0
+        while best >= before and length > SHORTEST:
+            shortened = bound(plan + length * step)
+            found = cost(shortened)
+            if found < best:
+                plan, best = shortened, found
+            length *= 0.5
+        if best >= before:
+            if len(plans) == 1:
+                return Status.SUCCESS, plan, count
+            plans, steps = [], []
+        idle = idle + 1 if before - best <= 1e-15 * abs(before) else 0
+        if idle > PATIENCE:
+            return Status.SUCCESS, plan, count
+    return Status.SUCCESS, plan, iterations
+
+
+def _mixed(plans: list[Array], steps: list[Array]) -> Array:
+    """Next plan of Anderson acceleration: the combination whose step is least, to first order."""
+    changes = np.array([b - a for a, b in pairwise(steps)])
+    moves = np.array([b - a for a, b in pairwise(plans)])
+    shares = np.linalg.lstsq(changes.reshape(len(changes), -1).T, steps[-1].ravel(), rcond=1e-10)[0]
+    return plans[-1] + steps[-1] - np.tensordot(shares, moves + changes, axes=1)
+
+
 class RtiSolver:
-    """Real-time iteration, or damped sequential programming to convergence, on the problem.
+    """Solver of the problem by real-time iteration, or by damped SQP to convergence.
 
     Parameters
     ----------
     problem
         The problem.
     iterations
-        Linearisations a solve: 1 is the real-time iteration, more iterate towards convergence
-        (`sqp`) and stop there.
+        Largest number of linearisations per solve: 1 is the real-time iteration, more iterate
+        until convergence (`converge`).
     damping
-        Levenberg term on (a, delta), added to R about the last plan: it costs nothing at
-        convergence and keeps full Gauss-Newton steps from cycling.
+        Levenberg term on (a, delta), added to R about the last plan: it does not change the
+        converged plan and keeps full Gauss-Newton steps from cycling.
     tolerance
-        Mean product t lam and infeasibility at which a quadratic program is solved.
+        Mean product t lam and infeasibility at which a QP counts as solved.
 
     Raises
     ------
@@ -99,9 +226,9 @@ class RtiSolver:
             ]
         )
         n = problem.horizon
-        stages, lanes = layout.working_space(n, 1)
+        stages, lanes = L.working_space(n, 1)
         self._stages, self._lanes = stages[0], lanes[0]
-        self._told = np.zeros(program.TOLD)
+        self._stats = np.zeros(qp.STATS)
         self._iterations = iterations
 
     def solve(
@@ -114,9 +241,9 @@ class RtiSolver:
     ) -> tuple[Solution, Array | None]:
         """Solve from `state` (6,), with the input in force (2,) and the weights (10,).
 
-        `reference` is (N + 1, 4). `warm` is what the last solve returned, shifted here by one
-        control period; without it the input in force is held. Never raises: what goes wrong is in
-        the status. The solution's cost is that of its predicted states.
+        `reference` is (N + 1, 4). `warm` is the plan that the last solve returned, shifted here by
+        one control period; without it the start is the input in force, held. Never raises: the
+        status reports failures. The solution's cost is that of its predicted states.
         """
         began = time.perf_counter()
         parameters = np.concatenate([state, last_input, reference.ravel(), weights])
@@ -129,27 +256,27 @@ class RtiSolver:
             plan = np.tile(last, (n, 1))
         else:
             plan = warm.copy()
-            plan[:-1] += self.constants[layout.SHIFT] * (plan[1:] - plan[:-1])
+            plan[:-1] += self.constants[L.SHIFT] * (plan[1:] - plan[:-1])
         given = state, last, reference, np.ascontiguousarray(weights, dtype=np.float64)
         if self._iterations == 1:
             self._prepare(state, plan, reference)
             code = rti.solve(
                 self._stages, self._lanes, float(last[0]), float(last[1]), given[-1],
-                self.constants, self._told,
+                self.constants, self._stats,
             )  # fmt: skip
-            status, iterations = STATUS[code], int(self._told[program.OUTER])
-            plan, cost = self._inputs(), float(self._told[program.COST])
-            found = layout.NOW_VX
+            status, iterations = STATUS[code], int(self._stats[qp.OUTER])
+            plan, cost = self._inputs(), float(self._stats[qp.COST])
+            found = L.NOW_VX
         else:
-            status, plan, iterations = sqp.converge(
+            status, plan, iterations = converge(
                 self._bounded(plan, last),
                 lambda about: self.solve_qp(*given, about),
-                lambda inputs: self._price(inputs, given),
+                lambda inputs: self._cost(inputs, given),
                 lambda inputs: self._bounded(inputs, last),
                 self._iterations,
             )
-            cost = self._price(plan, given)
-            found = layout.STEP_VX
+            cost = self._cost(plan, given)
+            found = L.STEP_VX
         seconds = time.perf_counter() - began
         if status is not Status.SUCCESS:
             return Solution(status, None, None, None, np.nan, iterations, seconds), None
@@ -165,21 +292,21 @@ class RtiSolver:
         return solution, plan
 
     def _bounded(self, inputs: Array, last: Array) -> Array:
-        """Inputs (N, 2) within their bounds and rates."""
-        tried: Array = self._stages[:-1, layout.STEP_A : layout.STEP_DELTA + 1]
+        """Return inputs (N, 2) clipped to their bounds and rates."""
+        tried: Array = self._stages[:-1, L.STEP_A : L.STEP_DELTA + 1]
         tried[:] = inputs
-        sqp.bound(self._stages, float(last[0]), float(last[1]), self.constants)
+        clamp_step(self._stages, float(last[0]), float(last[1]), self.constants)
         return tried.copy()
 
-    def _price(self, inputs: Array, given: tuple[Array, Array, Array, Array]) -> float:
-        """Exact cost of a plan; its roll-out and slacks are left in the working space."""
+    def _cost(self, inputs: Array, given: tuple[Array, Array, Array, Array]) -> float:
+        """Exact cost of a plan; leaves its roll-out and slacks in the working space."""
         state, _, reference, weights = given
         self._prepare(state, inputs, reference)
-        self._stages[:-1, layout.STEP_A : layout.STEP_DELTA + 1] = inputs
-        return float(sqp.evaluate(self._stages, self._lanes, weights, self.constants))
+        self._stages[:-1, L.STEP_A : L.STEP_DELTA + 1] = inputs
+        return float(roll_out_cost(self._stages, self._lanes, weights, self.constants))
 
     def linearise(self, state: Array, inputs: Array) -> Linearisation:
-        """Roll `inputs` (N, 2) out from `state` (6,) and differentiate along the way."""
+        """Roll `inputs` (N, 2) out from `state` (6,) and linearise along the roll-out."""
         self._prepare(state, inputs, None)
         linearisation.differentiate_along(self._stages, self.constants)
         return linearisation.unpacked(self._stages)
@@ -187,54 +314,54 @@ class RtiSolver:
     def solve_qp(
         self, state: Array, last_input: Array, reference: Array, weights: Array, inputs: Array
     ) -> tuple[Status, Array]:
-        """Solve the program linearised along the roll-out of `inputs` (N, 2); its inputs."""
+        """Solve the QP linearised along the roll-out of `inputs` (N, 2): status and inputs."""
         self._prepare(state, inputs, reference)
         linearisation.differentiate_along(self._stages, self.constants)
-        status = self._solve_program(last_input, weights)
+        status = self._solve_qp(last_input, weights)
         return status, self._inputs()
 
     def solve_model(
         self, model: Linearisation, last_input: Array, reference: Array, weights: Array,
         inputs: Array,
     ) -> Solution:  # fmt: skip
-        """Solve the program of a linear model along `inputs` (N, 2): x' = states + A dx + B du."""
+        """Solve the QP of a linear model along `inputs` (N, 2): x' = states + A dx + B du."""
         began = time.perf_counter()
         linearisation.pack(model, inputs, self._stages)
-        self._stages[:, layout.REFERENCE : layout.REFERENCE_Y + 1] = reference
-        self._told[:] = 0.0
-        status = self._solve_program(last_input, weights)
-        turns = int(self._told[program.INNER])
+        self._stages[:, L.REFERENCE : L.REFERENCE_Y + 1] = reference
+        self._stats[:] = 0.0
+        status = self._solve_qp(last_input, weights)
+        turns = int(self._stats[qp.INNER])
         seconds = time.perf_counter() - began
         if status is not Status.SUCCESS:
             return Solution(status, None, None, None, np.nan, turns, seconds)
-        cost = rti.cost_of(self._stages, self._lanes, layout.NOW_A, weights, self.constants)
+        cost = rti.cost_of(self._stages, self._lanes, L.NOW_A, weights, self.constants)
         return Solution(
-            status, self._inputs(), self._stages[:, layout.NOW_VX : layout.NOW_Y + 1].copy(),
+            status, self._inputs(), self._stages[:, L.NOW_VX : L.NOW_Y + 1].copy(),
             self._slack(), float(cost), turns, seconds,
         )  # fmt: skip
 
-    def _solve_program(self, last_input: Array, weights: Array) -> Status:
-        code = program.solve_program(
+    def _solve_qp(self, last_input: Array, weights: Array) -> Status:
+        code = qp.solve_qp(
             self._stages, self._lanes, float(last_input[0]), float(last_input[1]),
-            np.ascontiguousarray(weights, dtype=np.float64), self.constants, self._told,
+            np.ascontiguousarray(weights, dtype=np.float64), self.constants, self._stats,
         )  # fmt: skip
         return STATUS[code]
 
     def _slack(self) -> Array:
-        """Slacks of the solution, (N, 3) in the order of the problem's penalties."""
-        rows = np.array(layout.SLACKS)[list(layout.SLACK_OF)]
+        """Slacks of the solution, (N, 3), in the order of the problem's penalties."""
+        rows = np.array(L.SLACKS)[list(L.SLACK_OF)]
         slack: Array = self._lanes[rows].T.copy()
         return slack
 
     def _prepare(self, state: Array, plan: Array, reference: Array | None) -> None:
-        """Put a first state (6,), a plan (N, 2) and a reference (N + 1, 4) into the stages."""
+        """Write a first state (6,), a plan (N, 2) and a reference (N + 1, 4) to the stages."""
         stages = self._stages
-        stages[0, layout.PLAN_VX : layout.PLAN_Y + 1] = state
-        stages[:-1, layout.PLAN_A : layout.PLAN_DELTA + 1] = plan
+        stages[0, L.PLAN_VX : L.PLAN_Y + 1] = state
+        stages[:-1, L.PLAN_A : L.PLAN_DELTA + 1] = plan
         if reference is not None:
-            stages[:, layout.REFERENCE : layout.REFERENCE_Y + 1] = reference
+            stages[:, L.REFERENCE : L.REFERENCE_Y + 1] = reference
 
     def _inputs(self) -> Array:
-        """The solution's inputs, (N, 2)."""
-        inputs: Array = self._stages[:-1, layout.NOW_A : layout.NOW_DELTA + 1].copy()
+        """Inputs of the solution, (N, 2)."""
+        inputs: Array = self._stages[:-1, L.NOW_A : L.NOW_DELTA + 1].copy()
         return inputs

@@ -1,6 +1,7 @@
 """The NMPC whose weights are chosen while it drives: `lpv-nmpc-tuned`."""
 
 import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -9,17 +10,17 @@ from numpy.typing import NDArray
 
 from agents.base import CHECKPOINTS, Action, DrivingTask, check_compatible, observation_rows
 from agents.delay import NearFuture, moved_plan
-from agents.nmpc import qp as program
+from agents.nmpc import qp
 from agents.nmpc.rti_agent import RtiNmpc
-from agents.nmpc.rti_solver import DAMPING
+from agents.nmpc.settings import passes_settings
 from agents.reference import NODE
-from agents.weight_tuning.deciding import NOBODY, Decider
-from agents.weight_tuning.deciding_rows import finish_rows, prepare_rows
+from agents.weight_tuning.decision import NO_POLICY, Decider
+from agents.weight_tuning.history import REJECTED
+from agents.weight_tuning.loop_kernels import finish_rows, prepare_rows
 from agents.weight_tuning.loop_memory import LoopMemory, LoopRow
 from agents.weight_tuning.policy import WeightPolicy, load
-from agents.weight_tuning.watching import REJECTED
-from agents.weights import TrackingWeights, WeightSchedule
-from lpv_track_env.vehicle import VehicleParameters
+from agents.weights import TrackingWeights, WeightSchedule, weights_from
+from trajectories.compilation import entry_point
 
 Weights = WeightPolicy | WeightSchedule | TrackingWeights
 
@@ -34,24 +35,24 @@ fixed set, for whatever is seen, and a policy for the usual observations."""
 class TunedNmpc:
     """`lpv-nmpc`, its weights chosen as it drives: by a weight policy, a schedule, or fixed ones.
 
-    A policy decides anew every window and at every change of band, on what the agent itself sees
-    and does; what it does is bit for bit what `ClosedLoop.drive` does with it. Decisions that are
-    no numbers leave the weights as they are, all others are within the bounds of `WeightChoice`;
-    failed solves go down the ladder of `lpv-nmpc`.
+    A policy decides once per window and at every change of band, from what the agent observes and
+    does. Its actions are bit for bit those of `ClosedLoop.drive` with the same policy. Decisions
+    that are not finite leave the weights as they are, all others are within the bounds of
+    `WeightChoice`; failed solves are replaced as in `lpv-nmpc`.
 
     Parameters
     ----------
     task
-        What is driven.
+        Task of the agent.
     weights
-        A policy, a schedule, a set, or the .json of one of the first two; as shipped: "search",
-        the best fixed set, or "paired", a policy.
+        A policy, a schedule, a set, a mapping as in `NmpcSettings`, or the .json of a policy or a
+        schedule; shipped are "search", the best fixed set, and "paired", a policy.
     delay_compensation
-        Whether the NMPC is shown the observation of the time at which its action lands, see
-        `agents.delay`; by default where the task has delays. Errors and lags are watched in the
-        observations as they come.
-    horizon, model, linear_penalty, quadratic_penalty, damping, tolerance, max_failures, threads
-        As in `RtiNmpc`.
+        Predict the NMPC's observation to the time at which its action takes effect, see
+        `agents.delay`; by default where the task has delays. The driving history uses the
+        observations as they are.
+    **settings
+        Settings of `RtiNmpc`, except `selection`.
 
     Raises
     ------
@@ -61,25 +62,19 @@ class TunedNmpc:
     """
 
     compensates_delays: ClassVar[bool] = True
-    """It takes `delay_compensation` itself: `agents.make` wraps nothing around it."""
+    """The class takes `delay_compensation` itself: `agents.make` does not wrap it."""
 
+    @passes_settings(RtiNmpc, "selection")
     def __init__(
         self,
         task: DrivingTask,
         *,
-        weights: str | Path | Weights = "search",
+        weights: str | Path | Mapping[str, Any] | Weights = "search",
         delay_compensation: bool | None = None,
-        horizon: int | None = None,
-        model: VehicleParameters | None = None,
-        linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0),
-        quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0),
-        damping: tuple[float, float] = DAMPING,
-        tolerance: float = 1e-12,
-        max_failures: int = 10,
-        threads: int = 1,
+        **settings: Any,
     ) -> None:
         self.task = task
-        self.weights = _given(weights)
+        self.weights = _loaded(weights)
         policy = self.weights if isinstance(self.weights, WeightPolicy) else None
         if policy is not None:
             named = weights if isinstance(weights, str | Path) else repr(policy.algorithm)
@@ -88,37 +83,33 @@ class TunedNmpc:
                 control_period=policy.control_period, vehicle=policy.training.get("vehicle"),
                 stacklevel=4,
             )  # fmt: skip
-        self.nmpc = RtiNmpc(
-            task,
-            horizon=horizon,
-            weights=None if isinstance(self.weights, WeightPolicy) else self.weights,
-            model=model,
-            linear_penalty=linear_penalty,
-            quadratic_penalty=quadratic_penalty,
-            damping=damping,
-            tolerance=tolerance,
-            max_failures=max_failures,
-            threads=threads,
-        )
+        fixed = None if isinstance(self.weights, WeightPolicy) else self.weights
+        self.nmpc = RtiNmpc(task, weights=fixed, **settings)
         delayed = task.delayed if delay_compensation is None else delay_compensation
-        self.future = NearFuture(task, task.actuation, model) if delayed else None
+        self.future = NearFuture(task, task.actuation, settings.get("model")) if delayed else None
         self._decider = (
             None if policy is None else Decider(policy.choice, policy.layers, task.control_period)
         )
         widest = 1 if self._decider is None else self._decider.widest
         self._nodes = np.zeros((task.layout.preview_steps + 1, NODE))
-        self._scratch = np.zeros((2, widest), dtype=np.float32)
+        self._layers = np.zeros((2, widest), dtype=np.float32)
         self._memory: LoopMemory | None = None
-        # Of no rows: so it compiles here, if need be, and not within the first control period.
+        self._prepare: Callable[..., Any] | None = None
+        self._finish: Callable[..., Any] | None = None
+        # Called with zero rows to trigger compilation here, not in the first control period.
         self._decide(np.zeros((0, task.layout.size), dtype=np.float32), self._new(0))
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Entries of compiled functions cannot be pickled; they are made anew where needed.
+        return {**self.__dict__, "_prepare": None, "_finish": None}
+
     def _new(self, rows: int) -> LoopMemory:
-        sets = np.zeros((1, 10)) if self._decider is None else self._decider.packed.sets
+        sets = np.zeros((1, 10)) if self._decider is None else self._decider.arrays.sets
         horizon, size = self.nmpc.problem.horizon, self.task.layout.size
         return LoopMemory(rows, horizon, size, self.future, sets)
 
     def reset(self) -> None:
-        """Forget everything: the next call begins new episodes."""
+        """Clear the memory: the next call begins new episodes."""
         self._memory = None
 
     def predict(
@@ -155,64 +146,69 @@ class TunedNmpc:
 
     def _decide(self, rows: NDArray[np.float32], memory: LoopMemory) -> None:
         """Fill `memory.nmpc.actions` for observations (n, size)."""
-        nmpc = memory.nmpc
-        if self._decider is None:
-            tables, rules, choice = self.nmpc.switching.tables, self.nmpc.switching.rules, NOBODY
+        nmpc, arrays, decider = memory.nmpc, memory.arrays, self._decider
+        if decider is None:
+            switching, policy = self.nmpc.switching, NO_POLICY
+            weights = memory.weights(switching.tables, switching.rules)
         else:
-            tables, rules = memory.tables, self._decider.rules
-            choice = self._decider.arguments
-        future = np.zeros(0) if self.future is None else self.future.settings
-        arguments = (
-            rows, memory.looked, memory.commands, memory.feet, future, self._nodes, rules,
-            nmpc.bands, memory.watched, nmpc.actions, self.nmpc.problem.horizon,
-            self.task.control_period, tables, nmpc.weights, *choice, self._scratch,
+            weights, policy = memory.weights(memory.tables, decider.rules), decider.arrays
+        before = (
+            rows, arrays, weights, policy, nmpc.actions, self._nodes, self._layers,
+            self.nmpc.problem.horizon, self.task.control_period,
         )  # fmt: skip
-        prepare_rows(*arguments)
+        after = (arrays, nmpc.actions, nmpc.stats)
+        if self._prepare is None or self._finish is None:
+            # All arrays are C-ordered and made by this class: their types never change.
+            self._prepare = entry_point(prepare_rows, *before)
+            self._finish = entry_point(finish_rows, *after)
+        self._prepare(*before)
         began = time.perf_counter()
-        failed = self.nmpc.solve_rows(memory.looked, nmpc.weights, nmpc)
+        failed = self.nmpc.solve_rows(memory.nmpc_observations, nmpc.weights, nmpc)
         nmpc.seconds = time.perf_counter() - began
-        if nmpc.ladders or failed:
+        if nmpc.fallbacks or failed:
             self.nmpc.replace_failed(
-                memory.looked, nmpc, np.flatnonzero(nmpc.told[:, program.CODE] != program.SUCCESS)
+                memory.nmpc_observations, nmpc, np.flatnonzero(nmpc.stats[:, qp.CODE] != qp.SUCCESS)
             )
-        finish_rows(memory.watched, nmpc.told, memory.commands, nmpc.actions, future)
+        self._finish(*after)
 
     def hold(self, memory: LoopMemory | None = None) -> None:
-        """Let a control period pass in which nothing was computed: the last command stays."""
+        """Let a control period pass without a computation: the last command stays in force."""
         held = self._memory if memory is None else memory
         if held is not None:
             held.hold()
 
     def diagnostics(self, memory: LoopRow) -> dict[str, Any]:
-        """What `lpv-nmpc` tells of its last step for one vehicle, and what was chosen.
+        """Describe the last step of one vehicle: diagnostics of `lpv-nmpc` and the choice.
 
-        `weights` (10,) are Q, S, R in use; `band` is that of the preview; `rejected` counts
-        decisions of this episode that were no numbers.
+        `weights` (10,) are Q, S, R in use; `band` is that of the preview; `rejected` counts the
+        decisions of this episode that were not finite.
         """
         batch, row = memory.memory, memory.row
-        told = self.nmpc.diagnostics(batch.nmpc[row])
-        if told["plan"] is not None:
-            told["plan"] = moved_plan(told["plan"], batch.feet[row])
+        found = self.nmpc.diagnostics(batch.nmpc[row])
+        if found["plan"] is not None:
+            found["plan"] = moved_plan(found["plan"], batch.foot_points[row])
         return {
-            **told,
+            **found,
             "weights": batch.nmpc.weights[row].copy(),
             "band": int(batch.nmpc.bands[row]),
-            "rejected": int(batch.watched[row, REJECTED]),
+            "rejected": int(batch.history[row, REJECTED]),
         }
 
 
-def _given(weights: str | Path | Weights) -> Weights:
-    """Weights as they are, or those of a file.
+def _loaded(weights: str | Path | Mapping[str, Any] | Weights) -> Weights:
+    """Return weights as they are, or those of a mapping or a file.
 
     Raises
     ------
     ValueError
-        For a file that is not there or cannot be used, or for anything else.
+        For a mapping or a file that cannot be used, or for anything else.
     """
     if isinstance(weights, Weights):
         return weights
+    if isinstance(weights, Mapping):
+        return weights_from(weights)
     if not isinstance(weights, str | Path):
-        raise ValueError(  # noqa: TRY004  as every setting that cannot be used
+        raise ValueError(  # noqa: TRY004  one type of error for all settings
             "weights must be a policy of weights, a schedule, a set, or the .json of one of the "
             f"first two, not {type(weights).__name__}"
         )

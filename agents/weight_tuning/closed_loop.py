@@ -1,8 +1,8 @@
 """Closed loops in compiled code: n environments, each with its NMPC and its own weights.
 
-For tuning weights and for sweeps: one call drives every environment K control periods. What happens
-in each is bit for bit what the agent's `predict` and the environment's `step` would have done in
-turns, under every kind of conditions, whatever n is and however many threads share the work.
+For tuning weights and for sweeps: one call drives every environment for a number of control
+periods. The result is bit for bit that of calling the agent's `predict` and the environment's
+`step` in turns, under all conditions, for any n and any number of threads.
 """
 
 import math
@@ -17,11 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.delay import DelayCompensated
 from agents.nmpc.layout import working_space
+from agents.nmpc.rti import NmpcArrays
 from agents.nmpc.rti_agent import RtiNmpc
 from agents.nmpc.schedule import NO_BAND, rules_of
 from agents.reference import NODE
 from agents.weight_tuning import loop_kernels as loops
-from agents.weight_tuning.deciding import NOBODY, Decider
+from agents.weight_tuning.decision import NO_POLICY, Decider
 from agents.weight_tuning.loop_memory import LoopMemory
 from lpv_track_env import kernels as k
 from lpv_track_env.estimation import filter as filtering
@@ -34,10 +35,10 @@ Array = NDArray[Any]
 
 
 class Tally(NamedTuple):
-    """What a call of `ClosedLoop.drive` came to, an entry an environment, (n,)."""
+    """Sums over a call of `ClosedLoop.drive`, an entry for each environment, (n,)."""
 
     steps: Array
-    """Control periods driven: fewer than asked for where the episode ended."""
+    """Control periods driven; fewer than requested where the episode ended."""
     reward: Array
     lateral_square: Array
     """Sum of squared lateral errors, m^2; divided by `steps`, their mean square."""
@@ -48,7 +49,7 @@ class Tally(NamedTuple):
     steering_rate_square: Array
     """(rad/s)^2."""
     jerk_square: Array
-    """Of the acceleration command, (m/s^3)^2."""
+    """Squared jerk of the acceleration command, (m/s^3)^2."""
     max_lateral: Array
     """Largest absolute lateral error, m."""
     max_heading: Array
@@ -70,17 +71,17 @@ class ClosedLoop:
     Parameters
     ----------
     envs
-        The environments, autoreset mode DISABLED: one that has ended stands still until
-        `reset(options={"reset_mask": mask})`. Paths, vehicles and randomisation are theirs.
+        The environments, with autoreset mode DISABLED: one that has ended stands still until
+        `reset(options={"reset_mask": mask})`. They define paths, vehicles and randomisation.
     agent
-        `lpv-nmpc`, made for such an environment: its problem, settings, delay compensation, and its
-        weights or schedule where `drive` is given none.
+        `lpv-nmpc`, made for such an environment: its problem, settings and delay compensation, and
+        its weights or schedule where `drive` is given none.
     bands, slew
-        Of weights that `drive` is given: bands of curvature with a set each, and the largest change
-        of a weight's logarithm, 1/s. By default one set for all, and no limit.
+        Curvature bands of the weights that `drive` is given, with a set each, and the largest
+        change of a weight's logarithm, 1/s. By default one set for all bands, and no limit.
     decider
-        A weight policy at work: it chooses the weights where `drive` is given none; bands and slew
-        are its own.
+        A weight policy, which chooses the weights where `drive` is given none; it has bands and
+        slew of its own.
     threads
         Threads of a call, 1 by default. Results do not depend on it.
 
@@ -89,7 +90,7 @@ class ClosedLoop:
     ValueError
         For another autoreset mode, an agent for another layout, or an impossible number of threads.
     TypeError
-        For an agent that is not `lpv-nmpc`, with delay compensation around it or not.
+        For an agent other than `lpv-nmpc`, with or without delay compensation.
 
     Examples
     --------
@@ -130,17 +131,16 @@ class ClosedLoop:
             self.bands, self._rules = decider.choice.bands, decider.rules
         self.memory = LoopMemory(
             n, horizon, layout.size, future,
-            np.zeros((1, 10)) if decider is None else decider.packed.sets,
+            np.zeros((1, 10)) if decider is None else decider.arrays.sets,
         )  # fmt: skip
         self._threads = min(checked_threads(threads), n)
-        self._future = future.settings if future is not None else np.zeros(0)
         many = shares(self._threads)
-        self._work = (
+        self._work = loops.Workspace(
             np.zeros((many, layout.preview_steps + 1, NODE)),
             np.zeros((many, 2, 1 if decider is None else decider.widest), dtype=np.float32),
             *working_space(horizon, many),
+            np.zeros((many, filtering.WORK)),
         )
-        self._filter_work = np.zeros((many, filtering.WORK))
 
     def reset(
         self,
@@ -148,7 +148,7 @@ class ClosedLoop:
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin episodes as the environments' own `reset` does; their NMPCs forget."""
+        """Begin episodes as the environments' own `reset` does, and clear their NMPCs' memory."""
         result = self.envs.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask", np.ones(self.envs.num_envs, dtype=np.bool_))
         for row in np.flatnonzero(mask).tolist():
@@ -157,7 +157,7 @@ class ClosedLoop:
 
     @property
     def running(self) -> Array:
-        """Environments whose episode goes on, (n,) bool."""
+        """Mask of the environments whose episode has not ended, (n,) bool."""
         running: Array = self.envs.arrays.ends == k.RUNNING
         return running
 
@@ -169,7 +169,7 @@ class ClosedLoop:
         until_band: bool = False,
         trace: Array | None = None,
     ) -> Tally:
-        """Drive every running environment `periods` control periods, or to its episode's end.
+        """Drive every running environment for `periods` control periods, or to its episode's end.
 
         Parameters
         ----------
@@ -177,21 +177,21 @@ class ClosedLoop:
             At least 1.
         weights
             Q, S, R: (10,) for all, (n, 10), or (n, bands, 10) where the loop has bands; by default
-            the agent's own, its schedule's too. Rows that are not finite or negative are refused,
-            others brought within the bounds of weights.
+            the agent's own weights or schedule. Rows with entries that are negative or not finite
+            are refused, others are clipped to the bounds of weights.
         until_band
-            Whether an environment stops before the first solve in which its band is another, so
-            that it may be given other weights; `memory.nmpc.bands` and
-            `memory.watched` are those of the next period then.
+            Stop an environment before the first solve in another band, so that it can be given
+            other weights; `memory.nmpc.bands` and `memory.history` then are those of the next
+            period.
         trace
-            Filled if given, (n, periods, `kernels.RECORD_SIZE`): each environment's memory after
-            each period that it drove.
+            If given, filled with each environment's record after each period that it drove,
+            (n, periods, `kernels.RECORD_SIZE`).
 
         Raises
         ------
         ValueError
-            For weights of a wrong shape or value, less than one period, or an array to trace into
-            of a wrong kind.
+            For weights of a wrong shape or value, less than one period, or a trace of another
+            shape, type or memory layout.
         """
         n, periods = self.envs.num_envs, operator.index(periods)
         if periods < 1:
@@ -210,69 +210,60 @@ class ClosedLoop:
                 f"trace must be a writable C-ordered float64 array "
                 f"{(n, periods, k.RECORD_SIZE)}, not {trace.dtype} {trace.shape}"
             )
-        since, progress, asked = (
-            np.full(n, NO_BAND),
-            np.zeros(n, dtype=np.int64),
-            np.full(n, loops.ASKED),
-        )
-        tally = np.zeros((n, loops.TALLY))
-        memory, nmpc, arrays = self.memory, self.memory.nmpc, self.envs.arrays
+        memory, nmpc, decider = self.memory, self.memory.nmpc, self._decider
+        policy = NO_POLICY if decider is None or weights is not None else decider.arrays
+        run = loops.Run(
+            np.zeros(n, dtype=np.int64), np.full(n, loops.SOLVE), np.full(n, NO_BAND),
+            np.zeros((n, loops.TALLY)), trace,
+        )  # fmt: skip
         arguments = (
-            periods, *arrays[:-1], memory.looked, memory.commands, memory.feet, self._future, sets,
-            rules, nmpc.bands, nmpc.weights, memory.watched, until_band, since,
-            *(NOBODY if self._decider is None or weights is not None else self._decider.arguments),
-            self.agent.solver.constants, nmpc.plans, nmpc.flags, nmpc.told, nmpc.states,
-            nmpc.actions, progress, asked, tally, trace,
+            periods, until_band, self.envs.arrays, self.envs.condition_arrays, memory.arrays,
+            memory.weights(sets, rules), policy,
+            NmpcArrays(self.agent.solver.constants, *nmpc.arrays), run,
         )  # fmt: skip
         while True:
-            self._call(arguments)
-            stuck = np.flatnonzero(asked == loops.HELD)
-            if stuck.size == 0:
-                return Tally(*tally.T.copy())
-            self.agent.replace_failed(memory.looked, nmpc, stuck)
-            asked[stuck] = loops.GIVEN
+            self._drive_rows(arguments)
+            failed = np.flatnonzero(run.phases == loops.SOLVE_FAILED)
+            if failed.size == 0:
+                return Tally(*run.tally.T.copy())
+            self.agent.replace_failed(memory.nmpc_observations, nmpc, failed)
+            run.phases[failed] = loops.ACTION_GIVEN
 
-    def attend(self, mask: Array) -> None:
+    def take_in(self, mask: Array) -> None:
         """Take in the observations of environments that `mask` (n,) marks, before they drive on.
 
-        Bands and what is watched are up to date then; `drive` does the same by itself.
+        This brings their bands and histories up to date; `drive` does the same by itself.
         """
-        memory, arrays = self.memory, self.envs.arrays
-        loops.attend_rows(
-            mask, arrays.observations, memory.looked, memory.commands, memory.feet, self._future,
-            self._work[0][0], self._rules, memory.nmpc.bands, memory.watched, memory.nmpc.actions,
+        memory = self.memory
+        loops.take_in_rows(
+            mask, self.envs.arrays.observations, memory.arrays,
+            memory.weights(memory.tables, self._rules), memory.nmpc.actions, self._work.nodes[0],
             self.agent.problem.horizon, self.envs.single.control_period,
         )  # fmt: skip
 
-    def _call(self, arguments: tuple[Any, ...]) -> None:
-        """Drive all that are not HELD or PAUSED, in threads if the loop has them."""
-        n, given = self.envs.num_envs, self.envs.condition_arrays
-        work = (*self._work, *(() if given is None else (self._filter_work,)))
-        kernel: Any = loops.drive_rows if given is None else loops.drive_rows_under_conditions
-        more = () if given is None else (*given, self.envs.arrays.draws)
-        spaces = len(self._work)
+    def _drive_rows(self, arguments: tuple[Any, ...]) -> None:
+        """Drive all vehicles that are neither SOLVE_FAILED nor PAUSED, in the loop's threads."""
+        n = self.envs.num_envs
         if self._threads == 1:
-            own = [space[0] for space in work]
-            kernel(0, n, *arguments, *own[:spaces], *more, *own[spaces:])
+            own = loops.Workspace(*(space[0] for space in self._work))
+            alone: Any = (0, n, *arguments, own)
+            loops.drive_rows(*alone)
             return
-        many: Any = (
-            loops.drive_in_threads if given is None else loops.drive_in_threads_under_conditions
-        )
-        chunks = min(len(self._work[0]), n)
+        shared: Any = (min(len(self._work.nodes), n), n, *arguments, self._work)
         with using_threads(self._threads):
-            many(chunks, n, *arguments, *work[:spaces], *more, *work[spaces:])
+            loops.drive_in_threads(*shared)
 
     def copy(self, source: ArrayLike, target: ArrayLike) -> None:
-        """Make environments `target` those that `source` are, in every respect: both (m,) indices.
+        """Copy environments `source` (m,) onto environments `target` (m,), in every respect.
 
-        What they drive from there on is the same, disturbances included, under the same weights.
+        Under the same weights both drive the same from there on, disturbances included.
         """
         rows, onto = np.asarray(source, dtype=np.intp), np.asarray(target, dtype=np.intp)
         self.envs.copy(rows, onto)
         self.memory.copy(rows, onto)
 
     def _checked_weights(self, weights: ArrayLike | None) -> tuple[Array, Array]:
-        """Tables (1 or n, bands, 10) and the rules by which a band is chosen."""
+        """Return tables (1 or n, bands, 10) and the rules that choose a band."""
         if weights is None and self._decider is not None:
             return self.memory.tables, self._rules
         if weights is None:
@@ -290,5 +281,5 @@ class ClosedLoop:
         if bad.any():
             row = int(np.argmax(bad))
             raise ValueError(f"weights of environment {row} must be finite and >= 0: {values[row]}")
-        # A copy: one compiled form takes it, whatever array it came in.
+        # A copy, so that arrays of any layout use the same compiled kernel.
         return np.array(values, order="C"), self._rules

@@ -8,7 +8,7 @@ situation             8      vx - 10 m/s (10), |vy| (0.5 m/s), |r| (0.3 rad/s), 
                              |heading error| (0.1 rad), speed error (1 m/s)
 preview               6      largest |curvature| in each quarter of the preview (0.05 1/m); speed in
                              its middle and at its end, minus the reference speed (5 m/s)
-quick, slow           20     `watching.STATISTICS` over 0.4 s and over 4 s: ln(rms / scale) / 2, rms
+quick, slow           20     `history.STATISTICS` over 0.4 s and over 4 s: ln(rms / scale) / 2, rms
                              of at least 3 % of the scale
 solver                2      mean iterations since the last decision (10), share of failed solves
 weights               8      ln(Q, S in use / base) / ln(span)
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.weight_tuning.watching import (
+from agents.weight_tuning.history import (
     CLOCK,
     COUNT,
     FAILURES,

@@ -1,7 +1,7 @@
-"""Compiled kernels of closed loops: control periods of many vehicles, each with its NMPC."""
+"""Kernels of closed loops, compiled: control periods of many vehicles, each with its NMPC."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 from numpy.typing import NDArray
@@ -9,32 +9,69 @@ from numpy.typing import NDArray
 from agents.delay_kernels import look_ahead
 from agents.nmpc import rti
 from agents.nmpc.qp import CODE, INNER, SUCCESS
+from agents.nmpc.rti import NmpcArrays
 from agents.nmpc.schedule import NO_BAND, choose_weights, update_band
-from agents.weight_tuning.deciding import reconsider
-from agents.weight_tuning.watching import FAILURES, FRESH, passed, watch
-from agents.weight_tuning.watching import ITERATIONS as ITERATED
+from agents.weight_tuning import history
+from agents.weight_tuning.decision import PolicyArrays, decide_if_due
+from agents.weight_tuning.history import end_period, update_history
+from agents.weight_tuning.loop_memory import MemoryArrays, WeightArrays
 from lpv_track_env import kernels as k
 from lpv_track_env.conditions import layout as conditions_layout
 from lpv_track_env.conditions.episode import drive_under_conditions
-from lpv_track_env.vector_kernels import copy
+from lpv_track_env.vector_kernels import ConditionArrays, EnvArrays, copy
 from trajectories.compilation import compiled, compiled_internal, compiled_parallel
 
 Array = NDArray[Any]
 
+# Entries of a vehicle's tally, (TALLY,): see `closed_loop.Tally`.
 (
     STEPS, REWARD, LATERAL, HEADING, SPEED, STEERING_RATE, JERK, MAX_LATERAL, MAX_HEADING,
     STEERING_VARIATION, FAILED, CLIPPED, ITERATIONS, SOLVES,
 ) = range(14)  # fmt: skip
 TALLY = 14
 
-ASKED, GIVEN, HELD, PAUSED = range(4)
-"""What holds for a vehicle's next action: its NMPC is asked, `actions` has what replaces a failed
-solve, the vehicle is not to go on in this call."""
+# Phases of a vehicle within a call.
+(
+    SOLVE,  # its NMPC computes the next action
+    ACTION_GIVEN,  # the next action is in `actions` already, in place of a failed solve
+    SOLVE_FAILED,  # its solve has failed: it waits for a replacement
+    PAUSED,  # it waits for the next call
+) = range(4)
+
+
+class Run(NamedTuple):
+    """Progress of one call, a row a vehicle."""
+
+    progress: Array
+    """Control periods driven, (n,)."""
+    phases: Array
+    """SOLVE, ACTION_GIVEN, SOLVE_FAILED or PAUSED, (n,)."""
+    first_bands: Array
+    """Band of the first solve, (n,), NO_BAND before it."""
+    tally: Array
+    """(n, TALLY)."""
+    trace: Array
+    """Record after each period, (n, periods, RECORD_SIZE), or (n, 0, RECORD_SIZE) for none."""
+
+
+class Workspace(NamedTuple):
+    """Working space of one thread; with a leading dimension, that of all threads."""
+
+    nodes: Array
+    """Nodes of the preview, (preview steps + 1, NODE)."""
+    layers: Array
+    """Two layers of a policy's network, (2, widest) float32."""
+    stages: Array
+    """(N + 1, STAGE), see `agents.nmpc.layout`."""
+    lanes: Array
+    """(LANES, N)."""
+    filter: Array
+    """Working space of the state estimator."""
 
 
 @compiled_internal
-def count(record: Array, before_a: Any, before_delta: Any, period: Any, sums: Array) -> None:
-    """Add a period that was driven to its vehicle's tally, (TALLY,)."""
+def add_to_tally(record: Array, before_a: Any, before_delta: Any, period: Any, sums: Array) -> None:
+    """Add a control period that has been driven to its vehicle's tally, (TALLY,)."""
     change_a = record[k.ACCELERATION] - before_a
     change_delta = record[k.STEERING] - before_delta
     sums[STEPS] += 1.0
@@ -52,268 +89,220 @@ def count(record: Array, before_a: Any, before_delta: Any, period: Any, sums: Ar
 
 
 @compiled_internal
-def look(
-    observation: Array, commands: Array, foot: Array, future: Array, nodes: Array, seen: Array
-) -> None:
-    """Fill `seen` (size,) with what the NMPC is shown: with `future` settings, when it lands."""
+def prepare_observation(
+    observation: Array, commands: Array, foot_point: Array, delays: Array, nodes: Array,
+    shown: Array,
+) -> None:  # fmt: skip
+    """Fill `shown` (size,) with the observation for the NMPC.
+
+    With delay compensation it is predicted to the time at which the next action takes effect.
+    """
     total = 0.0
-    for j in range(seen.shape[0]):
-        seen[j] = observation[j]
-        total += abs(seen[j])
-    if future.shape[0] > 0:
-        foot[0] = foot[1] = foot[2] = 0.0
+    for j in range(shown.shape[0]):
+        shown[j] = observation[j]
+        total += abs(shown[j])
+    if delays.shape[0] > 0:
+        foot_point[0] = foot_point[1] = foot_point[2] = 0.0
         if math.isfinite(total):
-            look_ahead(seen, commands, future, nodes, foot)
+            look_ahead(shown, commands, delays, nodes, foot_point)
 
 
 @compiled_internal
-def remember(commands: Array, a: Any, delta: Any) -> None:
-    """Put a command before those that were sent earlier, (rows, 2)."""
+def push_command(commands: Array, a: Any, delta: Any) -> None:
+    """Put a command before those that were sent earlier, (rows, 2); the oldest is dropped."""
     for j in range(commands.shape[0] - 1, 0, -1):
         commands[j, 0], commands[j, 1] = commands[j - 1, 0], commands[j - 1, 1]
     commands[0, 0], commands[0, 1] = a, delta
 
 
-@compiled
-def attend(
-    row: int, observations: Array, looked: Array, commands: Array, feet: Array, future: Array,
-    nodes: Array, rules: Array, bands: Array, watched: Array, actions: Array, steps: int,
-    period: Any,
+@compiled_internal
+def take_in(
+    row: int, observations: Array, memory: MemoryArrays, weights: WeightArrays, actions: Array,
+    nodes: Array, horizon: int, period: Any,
 ) -> None:  # fmt: skip
-    """Take in a vehicle's observation, once: what the NMPC is shown, the band, what is watched."""
-    if watched[row, FRESH] > 0.0:
+    """Take a vehicle's observation in, once a period: NMPC's observation, band and history."""
+    own = memory.history[row]
+    if own[history.TAKEN_IN] > 0.0:
         return
-    look(observations[row], commands[row], feet[row], future, nodes, looked[row])
-    update_band(looked[row], steps, rules, bands, row)
-    watch(watched[row], observations[row], actions[row, 0], actions[row, 1], period)
+    shown = memory.nmpc_observations[row]
+    prepare_observation(
+        observations[row], memory.commands[row], memory.foot_points[row], memory.delays, nodes,
+        shown,
+    )  # fmt: skip
+    update_band(shown, horizon, weights.rules, weights.bands, row)
+    update_history(own, observations[row], actions[row, 0], actions[row, 1], period)
 
 
 @compiled
-def attend_rows(
-    mask: Array, observations: Array, looked: Array, commands: Array, feet: Array, future: Array,
-    nodes: Array, rules: Array, bands: Array, watched: Array, actions: Array, steps: int,
-    period: Any,
+def take_in_rows(
+    mask: Array, observations: Array, memory: MemoryArrays, weights: WeightArrays, actions: Array,
+    nodes: Array, horizon: int, period: Any,
 ) -> None:  # fmt: skip
-    """`attend` for every row that `mask` (n,) marks."""
+    """`take_in` for every row that `mask` (n,) marks."""
     for row in range(mask.shape[0]):
         if mask[row]:
-            attend(
-                row, observations, looked, commands, feet, future, nodes, rules, bands, watched,
-                actions, steps, period,
-            )  # fmt: skip
+            take_in(row, observations, memory, weights, actions, nodes, horizon, period)
 
 
 @compiled_internal
-def choose(
-    row: int, observations: Array, looked: Array, tables: Array, rules: Array, bands: Array,
-    weights: Array, watched: Array, network: Array, layers: Array, sets: Array, matrix: Array,
-    log_span: Any, catalogue: Array, scales: Array, window: int, scratch: Array, steps: int,
+def update_weights(
+    row: int, observations: Array, memory: MemoryArrays, weights: WeightArrays,
+    policy: PolicyArrays, layers: Array, horizon: int,
 ) -> None:  # fmt: skip
-    """Bring a vehicle's `weights` in use up to date with what `attend` took in.
-
-    Where there are `layers`, a policy writes the vehicle's table first, if it is time.
-    """
-    own = row if tables.shape[0] > 1 else 0
-    if layers.shape[0] > 0:
-        reconsider(
-            observations[row], watched[row], weights[row], bands[row], network, layers, sets,
-            matrix, log_span, catalogue, scales, window, tables[own], scratch,
+    """Update a vehicle's weights in use after `take_in`; a policy first decides, if due."""
+    table = weights.tables[row if weights.tables.shape[0] > 1 else 0]
+    if policy.layers.shape[0] > 0:
+        decide_if_due(
+            observations[row], memory.history[row], weights.in_use[row], weights.bands[row], policy,
+            table, layers,
         )  # fmt: skip
-    choose_weights(looked[row], steps, tables[own], rules, bands, row, weights[row])
+    choose_weights(
+        memory.nmpc_observations[row], horizon, table, weights.rules, weights.bands, row,
+        weights.in_use[row],
+    )  # fmt: skip
 
 
 @compiled_internal
-def solved(watched: Array, told: Array) -> None:
-    """Note what a solve took, by what it `told`, and whether it failed."""
-    watched[ITERATED] += told[INNER]
-    if told[CODE] != SUCCESS:
-        watched[FAILURES] += 1.0
+def count_solve(own: Array, stats: Array) -> None:
+    """Count a solve's iterations and its failure in a vehicle's history."""
+    own[history.ITERATIONS] += stats[INNER]
+    if stats[CODE] != SUCCESS:
+        own[history.FAILURES] += 1.0
 
 
-@compiled
-def decide(
-    row: int, asked: int, period: Any, observations: Array, looked: Array, commands: Array,
-    feet: Array, future: Array, tables: Array, rules: Array, bands: Array, weights: Array,
-    watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
-    matrix: Array, log_span: Any, catalogue: Array, scales: Array, window: int, constants: Array,
-    plans: Array, flags: Array, told: Array, states: Array, actions: Array, sums: Array,
-    nodes: Array, scratch: Array, stages: Array, lanes: Array,
+@compiled_internal
+def act(
+    row: int, period: Any, until_band: bool, observations: Array, memory: MemoryArrays,
+    weights: WeightArrays, policy: PolicyArrays, nmpc: NmpcArrays, run: Run, work: Workspace,
 ) -> int:  # fmt: skip
-    """Fill a vehicle's row of `actions`; HELD if its solve has failed, PAUSED at a band's end.
+    """Fill a vehicle's row of `actions`; returns its next phase.
 
-    With `until_band`, `since` (n,) is the band in which the call found the vehicle.
+    SOLVE_FAILED if its solve fails, PAUSED if with `until_band` its band is another than the first.
     """
-    if asked == ASKED:
-        attend(
-            row, observations, looked, commands, feet, future, nodes, rules, bands, watched,
-            actions, lanes.shape[1], period,
-        )  # fmt: skip
+    if run.phases[row] == SOLVE:
+        horizon = work.lanes.shape[1]
+        take_in(row, observations, memory, weights, nmpc.actions, work.nodes, horizon, period)
         if until_band:
-            if since[row] == NO_BAND:
-                since[row] = bands[row]
-            if since[row] != bands[row]:
+            if run.first_bands[row] == NO_BAND:
+                run.first_bands[row] = weights.bands[row]
+            if run.first_bands[row] != weights.bands[row]:
                 return PAUSED
-        choose(
-            row, observations, looked, tables, rules, bands, weights, watched, network, layers,
-            sets, matrix, log_span, catalogue, scales, window, scratch, lanes.shape[1],
-        )  # fmt: skip
+        update_weights(row, observations, memory, weights, policy, work.layers, horizon)
         failed = rti.control(
-            row, looked[row : row + 1], weights[row : row + 1], constants, plans, flags, told,
-            states, actions, stages, lanes,
+            row, memory.nmpc_observations[row : row + 1], weights.in_use[row : row + 1],
+            nmpc.constants, nmpc.plans, nmpc.flags, nmpc.stats, nmpc.states, nmpc.actions,
+            work.stages, work.lanes,
         )  # fmt: skip
-        sums[ITERATIONS] += told[row, INNER]
-        sums[SOLVES] += 1.0
-        solved(watched[row], told[row])
+        run.tally[row, ITERATIONS] += nmpc.stats[row, INNER]
+        run.tally[row, SOLVES] += 1.0
+        count_solve(memory.history[row], nmpc.stats[row])
         if failed > 0:
-            sums[FAILED] += 1.0
-            return HELD
-    if future.shape[0] > 0:
-        remember(commands[row], actions[row, 0], actions[row, 1])
-    return ASKED
+            run.tally[row, FAILED] += 1.0
+            return SOLVE_FAILED
+    if memory.delays.shape[0] > 0:
+        push_command(memory.commands[row], nmpc.actions[row, 0], nmpc.actions[row, 1])
+    return SOLVE
 
 
 @compiled
 def drive_rows(
-    first: int, last: int, periods: int, records: Array, observations: Array, ends: Array,
-    cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
-    feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
-    watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
-    matrix: Array, log_span: Any, catalogue: Array, scales: Array, window: int, constants: Array,
-    plans: Array, flags: Array, told: Array, states: Array, actions: Array, progress: Array,
-    asked: Array, tally: Array, trace: Array, nodes: Array, scratch: Array, stages: Array,
-    lanes: Array,
+    first: int, last: int, periods: int, until_band: bool, envs: EnvArrays,
+    conditions: ConditionArrays | None,
+    memory: MemoryArrays, weights: WeightArrays, policy: PolicyArrays, nmpc: NmpcArrays, run: Run,
+    work: Workspace,
 ) -> None:  # fmt: skip
-    """Drive vehicles first to last - 1 until `progress` (n,) reaches `periods` or they end.
+    """Drive vehicles first to last - 1 until their progress reaches `periods` or they end.
 
-    One whose solve fails stays where it is, `asked` (n,) HELD; set to GIVEN it goes on with its row
-    of `actions` in place of that solve. With `until_band` one waits, PAUSED, where the preview's
-    band changes, and in the end `bands` and `watched` are those of the next period. `trace`
-    (n, periods or 0, RECORD_SIZE) gets every record. `nodes`, `scratch`, `stages` and `lanes` are
-    working space.
+    A vehicle whose solve fails waits, SOLVE_FAILED; set to ACTION_GIVEN it goes on with its row of
+    `actions` in place of that solve. With `until_band` a vehicle waits, PAUSED, where the preview
+    enters another band, and on return bands and histories are those of the next period.
+    `conditions` is None under the conditions "simulation".
     """
     for row in range(first, last):
-        if asked[row] == HELD or asked[row] == PAUSED:
+        if run.phases[row] == SOLVE_FAILED or run.phases[row] == PAUSED:
             continue
-        record, case = records[row], cases[row]
-        table = tables[rows[case, 0] : rows[case, 1]]
-        period = env_constants[case, k.PERIOD]
-        while progress[row] < periods and ends[row] == k.RUNNING:
-            asked[row] = decide(
-                row, asked[row], period, observations, looked, commands, feet, future,
-                weight_tables, rules, bands, weights, watched, until_band, since, network, layers,
-                sets, matrix, log_span, catalogue, scales, window, constants, plans, flags, told,
-                states, actions, tally[row], nodes, scratch, stages, lanes,
-            )  # fmt: skip
-            if asked[row] != ASKED:
-                break
-            before_a, before_delta = record[k.ACCELERATION], record[k.STEERING]
-            ends[row] = k.drive(
-                record, actions[row, 0], actions[row, 1], env_constants[case], table,
-                observations[row],
-            )  # fmt: skip
-            if trace.shape[1] > 0:
-                copy(record, trace[row, progress[row]])
-            progress[row] += 1
-            count(record, before_a, before_delta, period, tally[row])
-            passed(watched[row])
-        if until_band and asked[row] == ASKED and ends[row] == k.RUNNING:
-            attend(
-                row, observations, looked, commands, feet, future, nodes, rules, bands, watched,
-                actions, lanes.shape[1], period,
-            )  # fmt: skip
-
-
-@compiled
-def drive_rows_under_conditions(
-    first: int, last: int, periods: int, records: Array, observations: Array, ends: Array,
-    cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
-    feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
-    watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
-    matrix: Array, log_span: Any, catalogue: Array, scales: Array, window: int, constants: Array,
-    plans: Array, flags: Array, told: Array, states: Array, actions: Array, progress: Array,
-    asked: Array, tally: Array, trace: Array, nodes: Array, scratch: Array, stages: Array,
-    lanes: Array, vehicles: Array, specs: Array, draws: Array, work: Array,
-) -> None:  # fmt: skip
-    """`drive_rows` under conditions, see `conditions_vector.advance` for the last four arrays."""
-    for row in range(first, last):
-        if asked[row] == HELD or asked[row] == PAUSED:
-            continue
-        record, case = records[row], cases[row]
-        table = tables[rows[case, 0] : rows[case, 1]]
-        period = env_constants[case, k.PERIOD]
-        while progress[row] < periods and ends[row] == k.RUNNING:
-            free_at = vehicles[row, conditions_layout.FREE_AT]
-            if free_at > record[k.STEPS] * period + conditions_layout.INSTANT:
-                # Busy with an earlier command: nothing is computed, the last one stays.
-                remember(commands[row], commands[row, 0, 0], commands[row, 0, 1])
+        record, case, observation = envs.records[row], envs.cases[row], envs.observations[row]
+        table = envs.tables[envs.rows[case, 0] : envs.rows[case, 1]]
+        constants = envs.constants[case]
+        period, actions, commands = constants[k.PERIOD], nmpc.actions[row], memory.commands[row]
+        while run.progress[row] < periods and envs.ends[row] == k.RUNNING:
+            busy = False
+            if conditions is not None:
+                now = record[k.STEPS] * period
+                free_at = conditions.vehicles[row, conditions_layout.FREE_AT]
+                busy = free_at > now + conditions_layout.INSTANT
+            if busy:
+                # The computer still works on an earlier command: the last one stays in force.
+                push_command(commands, commands[0, 0], commands[0, 1])
             else:
-                asked[row] = decide(
-                    row, asked[row], period, observations, looked, commands, feet, future,
-                    weight_tables, rules, bands, weights, watched, until_band, since, network,
-                    layers, sets, matrix, log_span, catalogue, scales, window, constants, plans,
-                    flags, told, states, actions, tally[row], nodes, scratch, stages, lanes,
+                run.phases[row] = act(
+                    row, period, until_band, envs.observations, memory, weights, policy, nmpc, run,
+                    work,
                 )  # fmt: skip
-                if asked[row] != ASKED:
+                if run.phases[row] != SOLVE:
                     break
             before_a, before_delta = record[k.ACCELERATION], record[k.STEERING]
-            ends[row] = drive_under_conditions(
-                vehicles[row], record, actions[row, 0], actions[row, 1], specs[case],
-                env_constants[case], table, observations[row], draws[row, 0], draws[row, 1], work,
-            )  # fmt: skip
-            if trace.shape[1] > 0:
-                copy(record, trace[row, progress[row]])
-            progress[row] += 1
-            count(record, before_a, before_delta, period, tally[row])
-            passed(watched[row])
-        if until_band and asked[row] == ASKED and ends[row] == k.RUNNING:
-            attend(
-                row, observations, looked, commands, feet, future, nodes, rules, bands, watched,
-                actions, lanes.shape[1], period,
+            if conditions is None:
+                envs.ends[row] = k.drive(
+                    record, actions[0], actions[1], constants, table, observation
+                )
+            else:
+                envs.ends[row] = drive_under_conditions(
+                    conditions.vehicles[row], record, actions[0], actions[1],
+                    conditions.specs[case], constants, table, observation, envs.draws[row, 0],
+                    envs.draws[row, 1], work.filter,
+                )  # fmt: skip
+            if run.trace.shape[1] > 0:
+                copy(record, run.trace[row, run.progress[row]])
+            run.progress[row] += 1
+            add_to_tally(record, before_a, before_delta, period, run.tally[row])
+            end_period(memory.history[row])
+        if until_band and run.phases[row] == SOLVE and envs.ends[row] == k.RUNNING:
+            take_in(
+                row, envs.observations, memory, weights, nmpc.actions, work.nodes,
+                work.lanes.shape[1], period,
             )  # fmt: skip
 
 
 @compiled_parallel
 def drive_in_threads(
-    chunks: int, n: int, periods: int, records: Array, observations: Array, ends: Array,
-    cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
-    feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
-    watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
-    matrix: Array, log_span: Any, catalogue: Array, scales: Array, window: int, constants: Array,
-    plans: Array, flags: Array, told: Array, states: Array, actions: Array, progress: Array,
-    asked: Array, tally: Array, trace: Array, nodes: Array, scratch: Array, stages: Array,
-    lanes: Array,
+    chunks: int, n: int, periods: int, until_band: bool, envs: EnvArrays,
+    conditions: ConditionArrays | None,
+    memory: MemoryArrays, weights: WeightArrays, policy: PolicyArrays, nmpc: NmpcArrays, run: Run,
+    work: Workspace,
 ) -> None:  # fmt: skip
-    """`drive_rows` on all n, in chunks that threads share; each has its own working space."""
+    """`drive_rows` on all n, in chunks that threads share, each with its own working space."""
     for chunk in numba.prange(chunks):
         drive_rows(
-            chunk * n // chunks, (chunk + 1) * n // chunks, periods, records, observations, ends,
-            cases, env_constants, tables, rows, looked, commands, feet, future, weight_tables,
-            rules, bands, weights, watched, until_band, since, network, layers, sets, matrix,
-            log_span, catalogue, scales, window, constants, plans, flags, told, states, actions,
-            progress, asked, tally, trace, nodes[chunk], scratch[chunk], stages[chunk],
-            lanes[chunk],
+            chunk * n // chunks, (chunk + 1) * n // chunks, periods, until_band, envs, conditions,
+            memory, weights, policy, nmpc, run,
+            Workspace(
+                work.nodes[chunk], work.layers[chunk], work.stages[chunk], work.lanes[chunk],
+                work.filter[chunk],
+            ),
         )  # fmt: skip
 
 
-@compiled_parallel
-def drive_in_threads_under_conditions(
-    chunks: int, n: int, periods: int, records: Array, observations: Array, ends: Array,
-    cases: Array, env_constants: Array, tables: Array, rows: Array, looked: Array, commands: Array,
-    feet: Array, future: Array, weight_tables: Array, rules: Array, bands: Array, weights: Array,
-    watched: Array, until_band: bool, since: Array, network: Array, layers: Array, sets: Array,
-    matrix: Array, log_span: Any, catalogue: Array, scales: Array, window: int, constants: Array,
-    plans: Array, flags: Array, told: Array, states: Array, actions: Array, progress: Array,
-    asked: Array, tally: Array, trace: Array, nodes: Array, scratch: Array, stages: Array,
-    lanes: Array, vehicles: Array, specs: Array, draws: Array, work: Array,
+# An agent's control period in two parts. The solve between them is a call of its own: called from
+# here, it would be compiled once more.
+
+
+@compiled
+def prepare_rows(
+    observations: Array, memory: MemoryArrays, weights: WeightArrays, policy: PolicyArrays,
+    actions: Array, nodes: Array, layers: Array, horizon: int, period: Any,
 ) -> None:  # fmt: skip
-    """`drive_in_threads` under conditions."""
-    for chunk in numba.prange(chunks):
-        drive_rows_under_conditions(
-            chunk * n // chunks, (chunk + 1) * n // chunks, periods, records, observations, ends,
-            cases, env_constants, tables, rows, looked, commands, feet, future, weight_tables,
-            rules, bands, weights, watched, until_band, since, network, layers, sets, matrix,
-            log_span, catalogue, scales, window, constants, plans, flags, told, states, actions,
-            progress, asked, tally, trace, nodes[chunk], scratch[chunk], stages[chunk],
-            lanes[chunk], vehicles, specs,
-            draws, work[chunk],
-        )  # fmt: skip
+    """Take observations (n, size) float32 in, and update the weights in use."""
+    for row in range(observations.shape[0]):
+        take_in(row, observations, memory, weights, actions, nodes, horizon, period)
+        update_weights(row, observations, memory, weights, policy, layers, horizon)
+
+
+@compiled
+def finish_rows(memory: MemoryArrays, actions: Array, stats: Array) -> None:
+    """Record solves by their statistics (n, STATS), and the actions (n, 2) that are sent."""
+    for row in range(actions.shape[0]):
+        count_solve(memory.history[row], stats[row])
+        if memory.delays.shape[0] > 0:
+            push_command(memory.commands[row], actions[row, 0], actions[row, 1])
+        end_period(memory.history[row])

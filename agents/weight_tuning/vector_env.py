@@ -18,7 +18,7 @@ from agents.weight_tuning.choice import (
     observation_space,
 )
 from agents.weight_tuning.closed_loop import ClosedLoop, Tally
-from agents.weight_tuning.deciding import Decider
+from agents.weight_tuning.decision import Decider
 from agents.weight_tuning.score import FAILED, failed, marginal_parts, parts_of, scores_of
 from agents.weights import in_words
 from lpv_track_env import kernels as k
@@ -142,7 +142,7 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         self._sums[:, mask] = 0.0
         self._ended[mask] = False
         self._rejected[mask] = self._clipped[mask] = 0
-        self.loop.attend(mask)
+        self.loop.take_in(mask)
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
         """Drive on with the weights that are chosen, until the window or the band ends."""
@@ -154,7 +154,7 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         self._ended = ends != k.RUNNING
         ended = self._ended & ~begins
         # What is seen where an episode ends is what would be seen if it went on.
-        self.loop.attend(ended)
+        self.loop.take_in(ended)
         self._add(tally)
         rewards = self._rewards(tally, ended)
         truncated = ended & (ends == k.TIME_LIMIT)

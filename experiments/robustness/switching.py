@@ -196,9 +196,9 @@ class Branches:
             tick()
         total = Tally(*sums)
         statuses: Counter[str] = Counter()
-        for row, ladder in loop.memory.nmpc.ladders.items():
+        for row, fallback in loop.memory.nmpc.fallbacks.items():
             if row % self.count == 0:
-                statuses.update(ladder.counts)
+                statuses.update(fallback.counts)
         return Outcome(
             seeds, loop.envs.arrays.ends[:: self.count].copy(), largest, total.lateral_square,
             total.steps, total.solves, total.failures, not_finite, used, statuses,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import agents
 from agents.weight_tuning.closed_loop import ClosedLoop, Tally
-from agents.weight_tuning.deciding import Decider
+from agents.weight_tuning.decision import Decider
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import PARTS, SCALES, failed, parts_of, scores_of
 from experiments.run.metrics import BANDS

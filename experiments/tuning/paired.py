@@ -19,7 +19,7 @@ import numpy as np
 import agents
 from agents.weight_tuning import features
 from agents.weight_tuning.closed_loop import ClosedLoop, Tally
-from agents.weight_tuning.deciding import Decider
+from agents.weight_tuning.decision import Decider
 from agents.weight_tuning.features import subset_mask
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import FAILED, SCALES, failed, rms_so_far, scores_of, squares_of
@@ -100,7 +100,7 @@ class PairedLearning(Tuner):
         """Drive all pairs once and add them to the model; return the sums of the drives."""
         first = episode_seed(self.settings.seed, self._rounds)
         self.loop.reset(seed=[first + k for k in range(self.pairs)] * 2)
-        self.loop.attend(np.ones(self.settings.drives, dtype=np.bool_))
+        self.loop.take_in(np.ones(self.settings.drives, dtype=np.bool_))
         sums = np.zeros((len(Tally._fields), self.settings.drives))
         shape = (self.settings.drives, self.choice.entries)
         before = np.zeros((self.pairs, self.choice.entries))
@@ -128,7 +128,7 @@ class PairedLearning(Tuner):
             action = np.clip(np.clip(x @ self.policy.T, -1.0, 1.0) + offsets, -1.0, 1.0)
             self._choose(action)
             tally = self.loop.drive(self._decider.window, self.loop.memory.tables)
-            self.loop.attend(np.ones(len(offsets), dtype=np.bool_))
+            self.loop.take_in(np.ones(len(offsets), dtype=np.bool_))
             self._solves += int(tally.solves.sum())
             driven += np.array(tally)
             actions += action / self.hold

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import DrivingTask
-from agents.nmpc.casadi_solver import CasadiSolver
-from agents.nmpc.fatrop_solver import FatropSolver
+from agents.nmpc.casadi_solvers import FatropSolver, IpoptSolver
 from agents.nmpc.ipopt_agent import IpoptNmpc
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import NmpcProblem, Solution, Status
@@ -85,7 +84,7 @@ class Sampler:
         self.vehicle = vehicle
         self.env = gymnasium.make(PATH_TRACKING, trajectory=SIX[0], vehicle=vehicle)
         self.agent = IpoptNmpc(DrivingTask.of(self.env), tolerance=IPOPT_TOLERANCE)
-        assert isinstance(self.agent.solver, CasadiSolver)
+        assert isinstance(self.agent.solver, IpoptSolver)
         self.ipopt = self.agent.solver
 
     def draw(self, index: int, seed: int) -> Situation:
@@ -151,7 +150,7 @@ class RealTimeSolver(Protocol):
         weights: Array,
         warm: Any = None,
     ) -> tuple[Solution, Any]:
-        """Do up to `iterations` iterations; as `CasadiSolver.solve`."""
+        """Do up to `iterations` iterations; as `IpoptSolver.solve`."""
         ...
 
     def linearise(self, state: Array, inputs: Array) -> Linearisation:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from agents.nmpc.casadi_solver import discrete_model, lpv_field
+from agents.nmpc.casadi_solvers import discrete_model, lpv_field
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import INPUTS, SOFT, STATES, NmpcProblem
 from lpv_track_env import lpv

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc.fatrop_solver import FatropSolver
+from agents.nmpc.casadi_solvers import FatropSolver
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from lpv_track_env.bicycle import derivative
 

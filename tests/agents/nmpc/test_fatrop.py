@@ -1,4 +1,4 @@
-"""fatrop, with its own transcription of the NMPC's problem, against IPOPT on the first one."""
+"""fatrop, with its own order of the NMPC's problem, against IPOPT."""
 
 import casadi as ca
 import gymnasium
@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 import agents
-from agents.nmpc.casadi_solver import CasadiSolver
-from agents.nmpc.fatrop_solver import FatropSolver
+from agents.nmpc.casadi_solvers import FatropSolver, IpoptSolver
 from agents.nmpc.problem import NmpcProblem, Status
 from agents.weights import TrackingWeights
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VehicleParameters
@@ -53,7 +52,7 @@ def situation(rng: np.random.Generator, vehicle: VehicleParameters) -> tuple[Arr
 @pytest.mark.parametrize("vehicle", [M2_MINIBUS, COURSE_CAR], ids=lambda car: car.name)
 def test_same_optimum_as_ipopt(vehicle: VehicleParameters) -> None:
     fatrop = FatropSolver(problem(vehicle), tolerance=1e-9)
-    ipopt = CasadiSolver(problem(vehicle), tolerance=1e-10)
+    ipopt = IpoptSolver(problem(vehicle), tolerance=1e-10)
     rng = np.random.default_rng(7)
     same, broken = 0, 0.0
     for _ in range(15):

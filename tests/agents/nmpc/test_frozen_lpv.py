@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 import agents
 from agents.nmpc import linearisation
 from agents.nmpc.frozen import FORMS, FrozenLpvSolver, _held
-from agents.nmpc.layout import RECORD, working_space
+from agents.nmpc.layout import DERIVATIVES, working_space
 from agents.nmpc.problem import NmpcProblem, Status
 from agents.nmpc.rti_solver import RtiSolver
 from lpv_track_env.bicycle import derivative
@@ -59,7 +59,7 @@ def test_a_model_is_packed_as_it_is_unpacked() -> None:
     linearisation.pack(model, case.inputs, stages)
     for one, other in zip(linearisation.unpacked(stages), model, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert stages[:-1, :RECORD].any(axis=0).all()
+    assert stages[:-1, :DERIVATIVES].any(axis=0).all()
 
 
 def test_a_true_linearisation_is_the_real_time_iterations_program() -> None:

@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 
 import agents
 from agents.base import DrivingTask
-from agents.nmpc.casadi_solver import CasadiSolver, discrete_model
+from agents.nmpc.casadi_solvers import IpoptSolver, discrete_model
 from agents.nmpc.ipopt_agent import IpoptNmpc
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.weights import TrackingWeights, WeightSchedule
@@ -65,8 +65,8 @@ def random_situation(rng: np.random.Generator, problem: NmpcProblem) -> tuple[Ar
 
 
 @pytest.fixture(scope="module")
-def solver() -> CasadiSolver:
-    return CasadiSolver(NmpcProblem(M2_MINIBUS, horizon=20, period=0.05), tolerance=1e-9)
+def solver() -> IpoptSolver:
+    return IpoptSolver(NmpcProblem(M2_MINIBUS, horizon=20, period=0.05), tolerance=1e-9)
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=list(VEHICLES))
@@ -109,7 +109,7 @@ def test_substeps_follow_the_stiffness() -> None:
     assert counts == {"m2-minibus": [1, 2, 3], "course-car": [1, 3, 5]}
 
 
-def test_plan_keeps_every_constraint_and_the_dynamics(solver: CasadiSolver) -> None:
+def test_plan_keeps_every_constraint_and_the_dynamics(solver: IpoptSolver) -> None:
     problem, rng = solver.problem, np.random.default_rng(1)
     car = problem.vehicle
     for _ in range(10):
@@ -144,7 +144,7 @@ def test_plan_keeps_every_constraint_and_the_dynamics(solver: CasadiSolver) -> N
 def test_optimum_equals_single_shooting_by_another_solver() -> None:
     """SciPy's SLSQP on inputs alone, with NumPy's dynamics, finds the same plan."""
     problem = NmpcProblem(M2_MINIBUS, horizon=5, period=0.1)
-    solver, rng = CasadiSolver(problem, tolerance=1e-10), np.random.default_rng(2)
+    solver, rng = IpoptSolver(problem, tolerance=1e-10), np.random.default_rng(2)
     q, s, r = WEIGHTS[:4], WEIGHTS[4:8], WEIGHTS[8:]
     for _ in range(5):
         state, last, reference = random_situation(rng, problem)
@@ -180,7 +180,7 @@ def test_optimum_equals_single_shooting_by_another_solver() -> None:
         np.testing.assert_allclose(solution.inputs.ravel(), other.x, atol=2e-3)
 
 
-def test_warm_start_changes_the_work_not_the_answer(solver: CasadiSolver) -> None:
+def test_warm_start_changes_the_work_not_the_answer(solver: IpoptSolver) -> None:
     state, last, reference = random_situation(np.random.default_rng(3), solver.problem)
     cold, warm = solver.solve(state, last, reference, WEIGHTS)
     again, _ = solver.solve(state, last, reference, WEIGHTS, warm)
@@ -190,7 +190,7 @@ def test_warm_start_changes_the_work_not_the_answer(solver: CasadiSolver) -> Non
     assert again.iterations < cold.iterations
 
 
-def test_mirrored_problem_has_the_mirrored_plan(solver: CasadiSolver) -> None:
+def test_mirrored_problem_has_the_mirrored_plan(solver: IpoptSolver) -> None:
     state, last, reference = random_situation(np.random.default_rng(4), solver.problem)
     left, _ = solver.solve(state, last, reference, WEIGHTS)
     flip = np.array([1, -1, -1, -1, 1, -1])
@@ -200,7 +200,7 @@ def test_mirrored_problem_has_the_mirrored_plan(solver: CasadiSolver) -> None:
     np.testing.assert_allclose(right.inputs, left.inputs * [1, -1], atol=1e-6)
 
 
-def test_weights_are_parameters(solver: CasadiSolver) -> None:
+def test_weights_are_parameters(solver: IpoptSolver) -> None:
     """Tenfold weights on everything leave the plan; a dear steering straightens it."""
     state, last, reference = random_situation(np.random.default_rng(5), solver.problem)
     state[5] = 0.5
@@ -214,7 +214,7 @@ def test_weights_are_parameters(solver: CasadiSolver) -> None:
 def test_impossible_curvature_is_slack_not_failure() -> None:
     """At 0.15 1/m the course car's sideslip must exceed 0.17 vx: soft, reported, solved."""
     problem = NmpcProblem(COURSE_CAR, horizon=20, period=0.05)
-    solver = CasadiSolver(problem)
+    solver = IpoptSolver(problem)
     kappa, speed = 0.1, 2.0
     s = speed * problem.period * np.arange(21)
     reference = np.column_stack(
@@ -271,8 +271,8 @@ def planned_inputs(memory: Any) -> Array:
 
 def counts(memory: Any) -> dict[str, int]:
     """Failures by status and fallbacks by name."""
-    ladder = memory.ladders[0] if hasattr(memory, "ladders") else memory[0].ladder
-    return dict(ladder.counts)
+    fallback = memory.fallbacks[0] if hasattr(memory, "fallbacks") else memory[0].fallback
+    return dict(fallback.counts)
 
 
 def test_nan_observation_gives_a_status_and_a_finite_action(
@@ -381,7 +381,7 @@ def test_ladder_of_fallbacks_when_solves_fail(
         if told["fallback"] == "stop":
             assert action[0] < 0
     assert seen == ["plan"] * 4 + ["stop"] * 2
-    assert memory[0].ladder.counts == {"INFEASIBLE": 6, "plan": 4, "stop": 2}
+    assert memory[0].fallback.counts == {"INFEASIBLE": 6, "plan": 4, "stop": 2}
     assert memory[0].warm is None
     # Without any plan to fall back on: Stanley.
     _, memory = agent.predict(observation, episode_start=np.array([True]))
@@ -457,7 +457,7 @@ def test_a_schedules_file_is_the_schedule(nmpc: tuple[gymnasium.Env, Any], tmp_p
     with pytest.raises(ValueError, match=r"weight schedule .*nowhere"):
         cls(task, weights=tmp_path / "nowhere.json")
     with pytest.raises(ValueError, match="weights must be weights, a schedule or its file, not"):
-        cls(task, weights={"Q": 1})
+        cls(task, weights=1)
 
 
 @functools.cache
@@ -503,8 +503,8 @@ def test_rollout_on_t2_is_as_good_as_promised(name: str) -> None:
 def test_a_solve_past_its_time_limit_says_so() -> None:
     problem = NmpcProblem(M2_MINIBUS, horizon=5)
     state, last, reference = random_situation(np.random.default_rng(6), problem)
-    hurried = CasadiSolver(problem, tolerance=1e-9, max_seconds=1e-6)
+    hurried = IpoptSolver(problem, tolerance=1e-9, max_seconds=1e-6)
     solution, _ = hurried.solve(state, last, reference, WEIGHTS)
     assert solution.status is Status.TIMEOUT
-    unhurried = CasadiSolver(problem, tolerance=1e-9)
+    unhurried = IpoptSolver(problem, tolerance=1e-9)
     assert unhurried.solve(state, last, reference, WEIGHTS)[0].status is Status.SUCCESS

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agents.nmpc.casadi_solver import CasadiSolver
+from agents.nmpc.casadi_solvers import IpoptSolver
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.nmpc.rti_solver import RtiSolver
 from experiments.verify.bench import scaled_error
@@ -46,7 +46,7 @@ def solved(solution: Solution) -> tuple[Array, Array, Array]:
 def test_iterated_it_converges_to_ipopts_optimum(car: VehicleParameters) -> None:
     """Costs agree to 1e-6 where both find the same of several optima; and IPOPT keeps our plan."""
     problem = NmpcProblem(car, horizon=15, first_period=0.03)
-    ours, ipopt = RtiSolver(problem, iterations=CONVERGED), CasadiSolver(problem, tolerance=1e-9)
+    ours, ipopt = RtiSolver(problem, iterations=CONVERGED), IpoptSolver(problem, tolerance=1e-9)
     same = 0
     for case in [*cases(5, problem), *cases(5, problem, decades=0.0, errors=0.3)]:
         mine, _ = ours.solve(*case.parameters)

@@ -279,14 +279,14 @@ def test_copies_drive_as_their_originals() -> None:
     loop.envs.arrays.observations[1, 5] = np.nan
     loop.drive(15)
     loop.copy([0, 1, 0], [3, 4, 5])
-    assert loop.memory.nmpc.ladders[4].counts == loop.memory.nmpc.ladders[1].counts
+    assert loop.memory.nmpc.fallbacks[4].counts == loop.memory.nmpc.fallbacks[1].counts
     weights = weights_of(2)[[0, 1, 0, 0, 1, 0]]
     tally, trace = traced(loop, 30, weights)
     for original, image in ((0, 3), (1, 4), (0, 5)):
         np.testing.assert_array_equal(trace[image], trace[original])
         assert [values[image] for values in tally] == [values[original] for values in tally]
     loop.copy([1, 1, 1], [4, 1, 5])
-    assert {1, 4, 5} <= set(loop.memory.nmpc.ladders)
+    assert {1, 4, 5} <= set(loop.memory.nmpc.fallbacks)
     loop.copy([0], [2])
     _, trace = traced(
         loop, 10, np.array([WEIGHTS, WEIGHTS, 3.0 ** np.arange(10) * WEIGHTS, *weights[3:]])

@@ -16,7 +16,7 @@ from tests.helpers.nmpc_situations import WEIGHTS
 
 
 @pytest.mark.parametrize(("entry", "value"), [(5, np.nan), (0, np.inf), (2, 1e20)])
-def test_failing_solves_go_down_the_ladder_as_in_predict(entry: int, value: float) -> None:
+def test_failing_solves_go_to_the_fallback_as_in_predict(entry: int, value: float) -> None:
     """Not finite, or finite and beyond solving: plan, then a stop; Stanley without a plan."""
     loop = loop_of(3, CALM, max_failures=3)
     turns = InTurns(3, CALM, None, max_failures=3)
@@ -39,7 +39,7 @@ def test_failing_solves_go_down_the_ladder_as_in_predict(entry: int, value: floa
     assert [row[2] for row in seen] == [""] * 4 + ["plan"] * 3 + ["stop"] * 3 + [""] * 2
     for row in (1, 2):
         _, memory = turns.agents[row].predict(turns.envs[row].arrays.observations.copy())
-        assert loop.memory.nmpc.ladders[row].counts == memory.ladders[0].counts
+        assert loop.memory.nmpc.fallbacks[row].counts == memory.fallbacks[0].counts
 
 
 def test_diagnostics_after_a_drive_are_those_of_its_last_period() -> None:

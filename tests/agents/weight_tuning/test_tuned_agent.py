@@ -18,9 +18,9 @@ from agents.weight_tuning import policy as policies
 from agents.weight_tuning.agent import SHIPPED, TunedNmpc
 from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.closed_loop import ClosedLoop
-from agents.weight_tuning.deciding import Decider
+from agents.weight_tuning.decision import Decider
 from agents.weight_tuning.features import size
-from agents.weight_tuning.loop_kernels import attend
+from agents.weight_tuning.loop_kernels import take_in
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
 from experiments.run import case as cases
@@ -86,7 +86,7 @@ def test_is_the_compiled_loop(conditions: Any, policy: WeightPolicy) -> None:
         np.testing.assert_array_equal(trace, turns.drive(15))
         assert_same(loop, turns)
         memories = [agent._memory for agent in turns.agents]
-        for name in ("watched", "tables"):
+        for name in ("history", "tables"):
             found = np.concatenate([getattr(memory, name) for memory in memories])
             np.testing.assert_array_equal(getattr(loop.memory, name), found, err_msg=name)
         for name in ("weights", "bands"):
@@ -100,7 +100,7 @@ def test_is_the_compiled_loop(conditions: Any, policy: WeightPolicy) -> None:
         turns.reset(np.flatnonzero(again))
     assert len(np.unique(np.concatenate(used), axis=0)) > (2 if policy is CATALOGUE else 5)
     # One compiled form at most for the loop and the agent: none, where both were on disk.
-    assert len(attend.signatures) <= 1  # type: ignore[attr-defined]
+    assert len(take_in.signatures) <= 1  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("conditions", ["simulation", "realtime"])
@@ -126,7 +126,7 @@ def test_failing_solves_are_those_of_the_compiled_loop(conditions: str) -> None:
     assert [row[2] for row in fallbacks] == [""] * 4 + ["plan"] * 3 + ["stop"] * 3 + [""] * 4
     for row in (1, 2):
         memory = turns.agents[row]._memory
-        assert loop.memory.nmpc.ladders[row].counts == memory.nmpc.ladders[0].counts
+        assert loop.memory.nmpc.fallbacks[row].counts == memory.nmpc.fallbacks[0].counts
 
 
 def test_a_batch_whose_rows_begin_and_fail_on_their_own_is_the_compiled_loop() -> None:
@@ -150,7 +150,7 @@ def test_a_batch_whose_rows_begin_and_fail_on_their_own_is_the_compiled_loop() -
         if starts.any():
             loop.reset(options=options)
             envs.reset(options=options)
-    assert sorted(memory.nmpc.ladders) == sorted(loop.memory.nmpc.ladders) != []
+    assert sorted(memory.nmpc.fallbacks) == sorted(loop.memory.nmpc.fallbacks) != []
 
 
 @pytest.mark.parametrize("conditions", ["simulation", SLOW_COMPUTER], ids=["sim", "slow"])
@@ -247,7 +247,7 @@ def test_holding_lets_a_period_pass() -> None:
     for _ in range(2):
         agent.hold(memory)
     agent.predict(observation)
-    assert memory.watched[0, 2] == 1.0
+    assert memory.history[0, 2] == 1.0
 
 
 def test_what_it_tells() -> None:
@@ -353,8 +353,8 @@ def test_files_of_weights(tmp_path: Path) -> None:
         agents.make(NAME, env.single, weights=tmp_path / "other.json")
     with pytest.raises(ValueError, match=r"weights .*none.json: no such file; give weights="):
         agents.make(NAME, env.single, weights=tmp_path / "none.json")
-    with pytest.raises(ValueError, match="not dict"):
-        agents.make(NAME, env.single, weights={"Q": (1, 1, 1, 1)})
+    with pytest.raises(ValueError, match="not list"):
+        agents.make(NAME, env.single, weights=[1.0] * 10)
     with pytest.raises(ValueError, match=r"has no setting 'wheights'.*nearest: weights"):
         agents.make(NAME, env.single, wheights=SCHEDULE)
 

@@ -12,16 +12,16 @@ import trajectories
 from agents.weight_tuning import features
 from agents.weight_tuning.env import WeightTuningEnv
 from agents.weight_tuning.features import LIMIT, SCALES, fill_features
-from agents.weight_tuning.watching import (
+from agents.weight_tuning.history import (
     AGE,
+    HISTORY,
     LAST,
     QUICK,
     SEEN,
     SLOW,
     STATISTICS,
-    WATCH,
-    passed,
-    watch,
+    end_period,
+    update_history,
 )  # fmt: skip
 from agents.weights import HIGHEST, LOWEST
 from lpv_track_env.observation import ObservationLayout
@@ -145,12 +145,12 @@ def filled(o: Any, w: Array, used: Array | None = None, band: int = 0) -> Array:
     return x
 
 
-def watched(observations: Any, actions: Any) -> Array:
-    w = np.zeros(WATCH)
+def history_of(observations: Any, actions: Any) -> Array:
+    w = np.zeros(HISTORY)
     for period, (o, (a, delta)) in enumerate(zip(observations, actions, strict=True)):
         if period > 0:
-            passed(w)
-        watch(w, np.asarray(o, dtype=np.float32), float(a), float(delta), PERIOD)
+            end_period(w)
+        update_history(w, np.asarray(o, dtype=np.float32), float(a), float(delta), PERIOD)
     return w
 
 
@@ -172,7 +172,7 @@ def test_whatever_is_observed_gives_finite_features(
 ) -> None:
     """NaN and infinities, or three entries of preview only, too; actions are finite, as ever."""
     finite = [tuple(np.nan_to_num(pair, posinf=1e3, neginf=-1e3)) for pair in actions]
-    w = watched(observations, finite[: len(observations)])
+    w = history_of(observations, finite[: len(observations)])
     x = filled(observations[-1], w, np.array(used), band)
     assert np.isfinite(x).all()
     assert (np.abs(x) <= LIMIT).all()
@@ -185,16 +185,16 @@ def test_an_observation_that_is_not_finite_is_passed_over() -> None:
     observations, actions = rng.normal(size=(6, 20)), rng.normal(size=(6, 2))
     broken = observations.copy()
     broken[3, 5] = np.nan
-    seen = watched(broken[:4], actions[:4])
+    seen = history_of(broken[:4], actions[:4])
     assert (seen[SEEN], seen[AGE]) == (3, 1)
-    np.testing.assert_array_equal(seen[QUICK:], watched(observations[:3], actions[:3])[QUICK:])
+    np.testing.assert_array_equal(seen[QUICK:], history_of(observations[:3], actions[:3])[QUICK:])
     ramp = np.zeros((9, 20))
     ramp[:, 3] = np.arange(9) * 0.2
     broken = ramp.copy()
     broken[[2, 5, 6], 0] = np.inf
     jerk = QUICK + STATISTICS.index("jerk")
     for drive in (ramp, broken):
-        assert watched(drive, ramp[:, 3:5])[jerk] == pytest.approx((0.2 / PERIOD) ** 2, rel=1e-5)
+        assert history_of(drive, ramp[:, 3:5])[jerk] == pytest.approx((0.2 / PERIOD) ** 2, rel=1e-5)
 
 
 def test_means_follow_at_their_time_constants() -> None:
@@ -202,9 +202,9 @@ def test_means_follow_at_their_time_constants() -> None:
     o = np.zeros((200, 20))
     o[:100, 5] = 0.3
     still = np.zeros((200, 2))
-    w = watched(o[:100], still[:100])
+    w = history_of(o[:100], still[:100])
     assert (w[QUICK], w[SLOW]) == pytest.approx((0.09, 0.09), rel=1e-6)
-    w = watched(o[:140], still[:140])
+    w = history_of(o[:140], still[:140])
     assert w[QUICK] == pytest.approx(0.09 * np.exp(-2.0 / 0.4), rel=1e-6)
     assert w[SLOW] == pytest.approx(0.09 * np.exp(-2.0 / 4.0), rel=1e-2)
     assert w[LAST] == 0.0
@@ -222,7 +222,10 @@ def test_mirrored_observations_have_the_same_features() -> None:
     observations, actions = np.array(hand.observations[1:]), np.array(hand.actions)
     k = hand.env.layout.preview_steps
     sign = np.concatenate([[1, -1, -1, 1, -1, -1, -1, 1], -np.ones(k), np.ones(k)])
-    ones, others = watched(observations, actions), watched(observations * sign, actions * [1, -1])
+    ones, others = (
+        history_of(observations, actions),
+        history_of(observations * sign, actions * [1, -1]),
+    )
     np.testing.assert_array_equal(
         filled(observations[-1], ones), filled(observations[-1] * sign, others)
     )

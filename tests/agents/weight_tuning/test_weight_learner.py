@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 import agents
 from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.closed_loop import ClosedLoop
-from agents.weight_tuning.deciding import Decider
+from agents.weight_tuning.decision import Decider
 from agents.weight_tuning.env import WeightTuningEnv
 from agents.weight_tuning.features import names
+from agents.weight_tuning.history import REJECTED
 from agents.weight_tuning.vector_env import WeightTuningVectorEnv
-from agents.weight_tuning.watching import REJECTED
 from tests.helpers.closed_loops import environments, traced
 from tests.helpers.tuned_drives import CALM, CHOICES, LIVELY, random_actions
 
@@ -252,4 +252,4 @@ def test_a_network_that_makes_no_number_leaves_the_base() -> None:
         loop.drive(40)
         loops.append(loop)
     np.testing.assert_array_equal(loops[0].envs.records, loops[1].envs.records)
-    assert (loops[0].memory.watched[:, REJECTED] >= 5).all()
+    assert (loops[0].memory.history[:, REJECTED] >= 5).all()

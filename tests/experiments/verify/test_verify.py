@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agents.nmpc.casadi_solver import CasadiSolver, discrete_model
+from agents.nmpc.casadi_solvers import IpoptSolver, discrete_model
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.weights import TrackingWeights
 from experiments.cli import main
@@ -135,7 +135,7 @@ def test_cost_of_ipopts_plan_is_its_objective(samplers: dict[str, Sampler]) -> N
     # Limits that every situation breaks, or the penalties would go unchecked.
     narrow = M2_MINIBUS.replace(max_lateral_velocity_ratio=0.01, speed_range=(1.0, 5.0))
     problem = NmpcProblem(narrow, horizon=10, first_period=0.03)
-    solver = CasadiSolver(problem, tolerance=1e-9)
+    solver = IpoptSolver(problem, tolerance=1e-9)
     broken = np.zeros(3)
     for _, case in draws(samplers, 8):
         parameters = (case.state, case.last_input, case.reference[:11], case.weights)
@@ -196,7 +196,7 @@ def test_without_piqp_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPa
 
 def test_ipopt_keeps_an_optimum_and_betters_what_is_none(samplers: dict[str, Sampler]) -> None:
     problem, case = draws(samplers, 2)[1]
-    solver = CasadiSolver(problem, tolerance=1e-8)
+    solver = IpoptSolver(problem, tolerance=1e-8)
     best, _ = solver.solve(*case.parameters)
     kept = solver.solve_from(best, *case.parameters)
     assert kept.status is Status.SUCCESS

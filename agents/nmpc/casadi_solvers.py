@@ -1,0 +1,462 @@
+"""Exact solvers of the NMPC's problem with CasADi: IPOPT, the paper's way, and fatrop.
+
+Both solve the problem by multiple shooting. The NLP is built once; weights, reference, state and
+last input are its parameters. Each solver orders the problem's stages in its own way, so that the
+two check one another.
+"""
+
+import time
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.nmpc.problem import INPUTS, OUTPUTS, SOFT, STATES, NmpcProblem, Solution, Status
+from lpv_track_env import lpv
+
+Array = NDArray[np.float64]
+
+INFINITY = np.inf
+IPOPT_STATUS = {
+    "Solve_Succeeded": Status.SUCCESS,
+    "Solved_To_Acceptable_Level": Status.SUCCESS,
+    "Maximum_Iterations_Exceeded": Status.MAXITER,
+    "Maximum_CpuTime_Exceeded": Status.TIMEOUT,
+    "Maximum_WallTime_Exceeded": Status.TIMEOUT,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+    "Restoration_Failed": Status.INFEASIBLE,
+    "Invalid_Number_Detected": Status.NAN,
+}
+COLD_OPTIONS: dict[str, Any] = {
+    "print_level": 0,
+    "sb": "yes",
+    "bound_relax_factor": 0.0,  # the default moves the optimum
+    "mumps_scaling": 0,
+    "mumps_permuting_scaling": 0,
+    "max_iter": 100,
+}
+WARM_OPTIONS: dict[str, Any] = {
+    **COLD_OPTIONS,
+    "warm_start_init_point": "yes",
+    "warm_start_bound_push": 1e-6,
+    "warm_start_bound_frac": 1e-6,
+    "warm_start_slack_bound_push": 1e-6,
+    "warm_start_slack_bound_frac": 1e-6,
+    "warm_start_mult_bound_push": 1e-6,
+    "mu_init": 1e-3,
+    "mu_strategy": "adaptive",  # 5 iterations a solve where the monotone strategy takes 13
+}
+FATROP_ITERATIONS = 200
+RELAXATION = 1e-8
+"""fatrop relaxes every bound b by RELAXATION max(1, |b|), which none of its options turns off."""
+
+
+def lpv_field(state: Any, action: Any, problem: NmpcProblem) -> Any:
+    """Vector field x' = A(x, u) x + B(x, u) u on CasADi symbols."""
+    a_matrix, b_matrix = lpv.casadi_matrices(state, action, problem.vehicle)
+    return ca.mtimes(a_matrix, state) + ca.mtimes(b_matrix, action)
+
+
+def discrete_model(problem: NmpcProblem) -> ca.Function:
+    """Build F(x, u), the state after one period, by Runge-Kutta steps of the LPV form."""
+    x, u = ca.SX.sym("x", STATES), ca.SX.sym("u", INPUTS)
+    field = ca.Function("field", [x, u], [lpv_field(x, u, problem)])
+    h, state = problem.period / problem.substeps, x
+    for _ in range(problem.substeps):
+        k1 = field(state, u)
+        k2 = field(state + 0.5 * h * k1, u)
+        k3 = field(state + 0.5 * h * k2, u)
+        k4 = field(state + h * k3, u)
+        state = state + h / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+    return ca.Function("F", [x, u], [state])
+
+
+class _Nlp:
+    """Parameters, variables, constraints and cost of an NLP while it is built, stage by stage."""
+
+    def __init__(self, problem: NmpcProblem) -> None:
+        self.problem, n = problem, problem.horizon
+        self.initial, self.last = ca.SX.sym("x0", STATES), ca.SX.sym("u_last", INPUTS)
+        self.reference = ca.SX.sym("reference", OUTPUTS, n + 1)
+        self.weights = ca.SX.sym("weights", 2 * OUTPUTS + INPUTS)
+        self.q, self.s, self.r = ca.vertsplit(
+            self.weights, [0, OUTPUTS, 2 * OUTPUTS, 2 * OUTPUTS + INPUTS]
+        )
+        self.cost: Any = 0
+        self.variables: list[Any] = []
+        self.lower: list[float] = []
+        self.upper: list[float] = []
+        self.constraints: list[Any] = []
+        self.lower_rows: list[float] = []
+        self.upper_rows: list[float] = []
+        self.equal: list[bool] = []
+        # Sizes of each stage: states, controls, rows besides the dynamics.
+        self.sizes: list[list[int]] = []
+
+    def begin(self, states: int) -> None:
+        """Begin a stage, whose states the stage before has added."""
+        self.sizes.append([states, 0, 0])
+
+    def control(self, name: str, size: int, low: Any, high: Any) -> Any:
+        """Add bounded variables of this stage."""
+        self.sizes[-1][1] += size
+        return self._add(name, size, low, high)
+
+    def state(self, name: str, size: int) -> Any:
+        """Add free variables, the next stage's states."""
+        return self._add(name, size, -INFINITY, INFINITY)
+
+    def _add(self, name: str, size: int, low: Any, high: Any) -> Any:
+        self.variables.append(ca.SX.sym(name, size))
+        self.lower.extend(np.broadcast_to(low, size))
+        self.upper.extend(np.broadcast_to(high, size))
+        return self.variables[-1]
+
+    def gap(self, expression: Any) -> None:
+        """Add the dynamics that lead to the next stage, = 0."""
+        self._constrain(expression, 0.0, 0.0, equal=True)
+
+    def limit(self, expression: Any, low: Any, high: Any) -> None:
+        """Add rows low <= expression <= high of this stage."""
+        self._constrain(expression, low, high, equal=False)
+        self.sizes[-1][2] += expression.shape[0]
+
+    def _constrain(self, expression: Any, low: Any, high: Any, *, equal: bool) -> None:
+        size = expression.shape[0]
+        self.constraints.append(expression)
+        self.lower_rows.extend(np.broadcast_to(low, size))
+        self.upper_rows.extend(np.broadcast_to(high, size))
+        self.equal.extend([equal] * size)
+
+    def limit_rate(self, state: Any, u: Any, slack: Any) -> None:
+        """Add the soft constraint on vx'."""
+        low, high = self.problem.vehicle.longitudinal_acceleration_range
+        rate = lpv_field(state, u, self.problem)[0]
+        self.limit(rate + slack, low, INFINITY)
+        self.limit(rate - slack, -INFINITY, high)
+
+    def limit_velocity(self, state: Any, slack: Any) -> None:
+        """Add the soft constraints on vx and vy, with a slack each."""
+        low, high = self.problem.vehicle.speed_range
+        ratio, vx, vy = self.problem.vehicle.max_lateral_velocity_ratio, state[0], state[1]
+        self.limit(vx + slack[0], low, INFINITY)
+        self.limit(vx - slack[0], -INFINITY, high)
+        self.limit(vy - ratio * vx - slack[1], -INFINITY, 0.0)
+        self.limit(-vy - ratio * vx - slack[1], -INFINITY, 0.0)
+
+    def error(self, i: int, state: Any) -> Any:
+        """Output error at node i."""
+        return self.reference[:, i] - ca.mtimes(ca.DM(lpv.C), state)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the NLP as `casadi.nlpsol` takes it."""
+        return {
+            "x": ca.vertcat(*self.variables),
+            "f": self.cost,
+            "g": ca.vertcat(*self.constraints),
+            "p": ca.vertcat(self.initial, self.last, ca.vec(self.reference), self.weights),
+        }
+
+
+class _NlpSolver(ABC):
+    """A solver of the problem as an NLP, whose variables are N groups of `GROUP`."""
+
+    GROUP: ClassVar[int]
+    INPUT: ClassVar[slice]
+    STATE: ClassVar[slice]
+    SLACK: ClassVar[list[int]]
+    """Columns of the slacks on vx, vy, vx' in a group."""
+
+    problem: NmpcProblem
+    _model: ca.Function
+    _bounds: dict[str, Array]
+
+    def solve(
+        self, state: Array, last_input: Array, reference: Array, weights: Array, warm: Any = None
+    ) -> tuple[Solution, Any]:
+        """Solve from `state` (6,), with the input in force (2,) and the weights (10,).
+
+        `reference` is (N + 1, 4). `warm` is the warm start that the last solve returned, shifted by
+        one period here. Never raises: the status reports failures.
+        """
+        began = time.perf_counter()
+        solver, guess = self._start(state, last_input, warm)
+        parameters = np.concatenate([state, last_input, reference.ravel(), weights])
+        return self._run(solver, guess, parameters, began)
+
+    def _run(
+        self, solver: ca.Function, guess: dict[str, Array], parameters: Array, began: float
+    ) -> tuple[Solution, Any]:
+        if not np.isfinite(parameters).all():
+            return Solution(Status.NAN, None, None, None, np.nan, 0, 0.0), None
+        try:
+            result = solver(p=parameters, **self._bounds, **guess)
+            statistics = solver.stats()
+        except RuntimeError:
+            seconds = time.perf_counter() - began
+            return Solution(Status.QP_FAILURE, None, None, None, np.nan, 0, seconds), None
+        seconds = time.perf_counter() - began
+        iterations, cost = int(statistics["iter_count"]), float(result["f"])
+        groups = np.asarray(result["x"]).reshape(self.problem.horizon, self.GROUP)
+        status = self._status(statistics)
+        if status is Status.NAN or not (np.isfinite(groups).all() and np.isfinite(cost)):
+            return Solution(Status.NAN, None, None, None, np.nan, iterations, seconds), None
+        states = np.vstack([parameters[:STATES], groups[:, self.STATE]])
+        inputs, slack = groups[:, self.INPUT].copy(), groups[:, self.SLACK]
+        plan = Solution(status, inputs, states, slack, cost, iterations, seconds)
+        return plan, self._warm(result)
+
+    def _cold(self, state: Array, last_input: Array) -> Array:
+        """Guess without a plan: the motion of the model under the input in force, held."""
+        low, high = self.problem.input_bounds
+        held = last_input.clip(low, high)
+        guess = np.zeros((self.problem.horizon, self.GROUP))
+        guess[:, self.INPUT] = held
+        for row in guess:
+            row[self.STATE] = state = np.asarray(self._model(state, held)).ravel()
+        return guess if np.isfinite(guess).all() else np.zeros_like(guess)
+
+    @abstractmethod
+    def _start(
+        self, state: Array, last_input: Array, warm: Any
+    ) -> tuple[ca.Function, dict[str, Array]]:
+        """Choose the solver, and its guess."""
+
+    @abstractmethod
+    def _status(self, statistics: dict[str, Any]) -> Status:
+        """Status of a solve by CasADi's statistics."""
+
+    @abstractmethod
+    def _warm(self, result: dict[str, Any]) -> Any:
+        """Warm start for the next solve."""
+
+
+def _shift(values: Array) -> Array:
+    """Shift the rows of an array by one; the last one is repeated."""
+    return np.vstack([values[1:], values[-1:]])
+
+
+class IpoptSolver(_NlpSolver):
+    """IPOPT on the NMPC's problem: the reference for correctness.
+
+    The variables of a group are u_i (2), slack_i (3) and x_{i+1} (6).
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    tolerance
+        IPOPT's relative tolerance.
+    max_seconds
+        Time limit of a solve, s; beyond it the status is TIMEOUT.
+    """
+
+    GROUP = INPUTS + SOFT + STATES
+    INPUT, STATE = slice(0, INPUTS), slice(INPUTS + SOFT, GROUP)
+    SLACK: ClassVar[list[int]] = [2, 3, 4]
+
+    def __init__(
+        self, problem: NmpcProblem, *, tolerance: float = 1e-6, max_seconds: float = 20.0
+    ) -> None:
+        self.problem, self._model = problem, discrete_model(problem)
+        nlp = self._transcribed()
+        given = nlp.as_dict()
+        self._bounds = {
+            "lbx": np.array(nlp.lower, dtype=np.float64),
+            "ubx": np.array(nlp.upper, dtype=np.float64),
+            "lbg": np.array(nlp.lower_rows, dtype=np.float64),
+            "ubg": np.array(nlp.upper_rows, dtype=np.float64),
+        }
+        shared: dict[str, Any] = {"expand": True, "print_time": False, "error_on_fail": False}
+        limits = {"tol": tolerance, "max_wall_time": max_seconds}
+        cold = {**shared, "ipopt": {**COLD_OPTIONS, **limits}}
+        self._cold_solver = ca.nlpsol("nmpc", "ipopt", given, cold)
+        # The warm-started solver uses the same derivative functions, built once.
+        for option, name in (
+            ("grad_f", "nlp_grad_f"), ("jac_g", "nlp_jac_g"), ("hess_lag", "nlp_hess_l"),
+        ):  # fmt: skip
+            shared[option] = self._cold_solver.get_function(name)
+        warm = {**shared, "ipopt": {**WARM_OPTIONS, **limits}}
+        self._warm_solver = ca.nlpsol("nmpc", "ipopt", given, warm)
+
+    def _transcribed(self) -> _Nlp:
+        problem = self.problem
+        nlp = _Nlp(problem)
+        low_u, high_u = problem.input_bounds
+        linear, quadratic = ca.DM(problem.linear_penalty), ca.DM(problem.quadratic_penalty)
+        nlp.begin(0)
+        state, previous = nlp.initial, nlp.last
+        for i, steps in enumerate(problem.input_steps):
+            u = nlp.control(f"u{i}", INPUTS, low_u, high_u)
+            slack = nlp.control(f"s{i}", SOFT, 0.0, INFINITY)
+            following = nlp.state(f"x{i + 1}", STATES)
+            nlp.cost += 0.5 * (ca.dot(nlp.q, nlp.error(i, state) ** 2) + ca.dot(nlp.r, u**2))
+            nlp.cost += ca.dot(linear, slack) + 0.5 * ca.dot(quadratic, slack**2)
+            nlp.gap(self._model(state, u) - following)
+            nlp.limit(u - previous, -steps, steps)
+            nlp.limit_rate(state, u, slack[2])
+            nlp.limit_velocity(following, slack)
+            state, previous = following, u
+        nlp.cost += 0.5 * ca.dot(nlp.s, nlp.error(problem.horizon, state) ** 2)
+        return nlp
+
+    def solve_from(
+        self, plan: Solution, state: Array, last_input: Array, reference: Array, weights: Array
+    ) -> Solution:
+        """Solve as `solve` does, starting from another solver's plan for the same situation.
+
+        An optimal plan is kept: this distinguishes another local optimum from a plan that is none.
+
+        Raises
+        ------
+        ValueError
+            If the solution holds no plan.
+        """
+        if plan.inputs is None or plan.states is None or plan.slack is None:
+            raise ValueError(f"there is no plan to start from: status {plan.status.value}")
+        began = time.perf_counter()
+        guess = {"x0": np.column_stack([plan.inputs, plan.slack, plan.states[1:]]).ravel()}
+        parameters = np.concatenate([state, last_input, reference.ravel(), weights])
+        return self._run(self._warm_solver, guess, parameters, began)[0]
+
+    def _start(
+        self, state: Array, last_input: Array, warm: dict[str, Array] | None
+    ) -> tuple[ca.Function, dict[str, Array]]:
+        if warm is None:
+            return self._cold_solver, {"x0": self._cold(state, last_input).ravel()}
+        n = self.problem.horizon
+        shifted = {name: _shift(values.reshape(n, -1)).ravel() for name, values in warm.items()}
+        return self._warm_solver, shifted
+
+    def _status(self, statistics: dict[str, Any]) -> Status:
+        return IPOPT_STATUS.get(statistics["return_status"], Status.QP_FAILURE)
+
+    def _warm(self, result: dict[str, Any]) -> dict[str, Array]:
+        """Primal and dual variables, stage by stage."""
+        names = {"x0": "x", "lam_x0": "lam_x", "lam_g0": "lam_g"}
+        return {guess: np.asarray(result[name]).ravel() for guess, name in names.items()}
+
+
+class FatropSolver(_NlpSolver):
+    """fatrop on the NMPC's problem: a second exact solver, to check IPOPT.
+
+    fatrop (Vanroye, Sathya, De Schutter, Decre, IROS 2023) is an interior-point method whose linear
+    algebra is a Riccati recursion, so neighbouring stages may be coupled by the dynamics alone. The
+    bound on the input's change couples u_i with u_{i-1}: the last input joins the state::
+
+        stage 0     controls u_0, s_0                 (x_0 and the input in force are parameters)
+        stage i     states x_i, u_{i-1}               controls sigma_i, u_i, s_i       0 < i < N
+        stage N     states x_N, u_{N-1}               controls sigma_N
+
+    s_i is the slack on vx'(x_i, u_i), sigma_i (2) that on vx_i and vy_i: each belongs to the stage
+    whose variables it relaxes. The variables are N groups (u_i, s_i, x_{i+1}, u_i, sigma_{i+1}).
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    tolerance
+        fatrop's tolerance on the scaled optimality conditions.
+
+    Raises
+    ------
+    ValueError
+        If the installed CasADi was built without fatrop.
+
+    fatrop has no time limit; `FATROP_ITERATIONS` bounds a solve. With a tolerance below 1e-6 it
+    regularises Hessians near some optima and then gives up (QP_FAILURE from its line search, or
+    MAXITER; one in ten at 1e-8), although IPOPT agrees with its plan.
+    """
+
+    GROUP = INPUTS + SOFT + STATES + INPUTS
+    INPUT, STATE = slice(0, INPUTS), slice(INPUTS + 1, INPUTS + 1 + STATES)
+    APPLIED = slice(STATE.stop, STATE.stop + INPUTS)
+    SLACK: ClassVar[list[int]] = [APPLIED.stop, APPLIED.stop + 1, INPUTS]
+
+    def __init__(self, problem: NmpcProblem, *, tolerance: float = 1e-6) -> None:
+        if not ca.has_nlpsol("fatrop"):
+            raise ValueError(
+                "this CasADi was built without fatrop: say solver='ipopt', or install its wheel "
+                "from PyPI"
+            )
+        self.problem, self._model = problem, discrete_model(problem)
+        nlp = self._transcribed()
+        states, controls, rows = (list(sizes) for sizes in zip(*nlp.sizes, strict=True))
+        options: dict[str, Any] = {
+            "structure_detection": "manual",
+            "N": problem.horizon,
+            "nx": states,
+            "nu": controls,
+            "ng": rows,
+            "expand": True,
+            "print_time": False,
+            "error_on_fail": False,
+            "fatrop": {"print_level": 0, "tolerance": tolerance, "max_iter": FATROP_ITERATIONS},
+        }
+        self._bounds = {
+            "lbx": _tightened(nlp.lower, 1.0),
+            "ubx": _tightened(nlp.upper, -1.0),
+            "lbg": _tightened(nlp.lower_rows, 1.0, equal=nlp.equal),
+            "ubg": _tightened(nlp.upper_rows, -1.0, equal=nlp.equal),
+        }
+        self._solver = ca.nlpsol("nmpc", "fatrop", nlp.as_dict(), options)
+
+    def _transcribed(self) -> _Nlp:
+        problem, n = self.problem, self.problem.horizon
+        nlp = _Nlp(problem)
+        low_u, high_u = problem.input_bounds
+
+        def penalty(slack: Any, entry: int) -> Any:
+            linear, quadratic = problem.linear_penalty[entry], problem.quadratic_penalty[entry]
+            return linear * slack + 0.5 * quadratic * slack**2
+
+        x, applied = nlp.initial, nlp.last
+        for i in range(n + 1):
+            nlp.begin(0 if i == 0 else STATES + INPUTS)
+            here = x
+            nlp.cost += 0.5 * ca.dot(nlp.q if i < n else nlp.s, nlp.error(i, here) ** 2)
+            if i > 0:
+                sigma = nlp.control(f"sigma{i}", 2, 0.0, INFINITY)
+                nlp.cost += penalty(sigma[0], 0) + penalty(sigma[1], 1)
+            if i < n:
+                u = nlp.control(f"u{i}", INPUTS, low_u, high_u)
+                rate_slack = nlp.control(f"s{i}", 1, 0.0, INFINITY)
+                nlp.cost += 0.5 * ca.dot(nlp.r, u**2) + penalty(rate_slack, 2)
+                following = nlp.state(f"x{i + 1}", STATES + INPUTS)
+                # fatrop needs the gap as x_{i+1} - F, and before the stage's other rows.
+                nlp.gap(following - ca.vertcat(self._model(here, u), u))
+                nlp.limit(u - applied, -problem.input_steps[i], problem.input_steps[i])
+                nlp.limit_rate(here, u, rate_slack)
+                x, applied = following[:STATES], following[STATES:]
+            if i > 0:
+                nlp.limit_velocity(here, sigma)
+        return nlp
+
+    def _start(
+        self, state: Array, last_input: Array, warm: Array | None
+    ) -> tuple[ca.Function, dict[str, Array]]:
+        if warm is not None:
+            return self._solver, {"x0": _shift(warm).ravel()}
+        guess = self._cold(state, last_input)
+        guess[:, self.APPLIED] = guess[:, self.INPUT]
+        return self._solver, {"x0": guess.ravel()}
+
+    def _status(self, statistics: dict[str, Any]) -> Status:
+        if statistics["success"]:
+            return Status.SUCCESS
+        exhausted = int(statistics["iter_count"]) >= FATROP_ITERATIONS
+        return Status.MAXITER if exhausted else Status.QP_FAILURE
+
+    def _warm(self, result: dict[str, Any]) -> Array:
+        """Variables, group by group (N, 13)."""
+        return np.asarray(result["x"]).reshape(-1, self.GROUP)
+
+
+def _tightened(bounds: list[float], sign: float, equal: list[bool] | None = None) -> Array:
+    """Tighten bounds by what fatrop will relax them; equalities stay."""
+    values = np.array(bounds, dtype=np.float64)
+    moved = np.isfinite(values) & ~np.array(equal or [False] * len(bounds), dtype=np.bool_)
+    values[moved] += sign * RELAXATION * np.maximum(1.0, np.abs(values[moved]))
+    return values

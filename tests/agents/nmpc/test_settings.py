@@ -1,0 +1,89 @@
+"""Settings of the NMPC agents: weights given as mappings, signatures, errors in one line."""
+
+import inspect
+from typing import Any
+
+import numpy as np
+import pytest
+
+import agents
+from agents.base import DrivingTask
+from agents.nmpc.frozen import FrozenLpvMpc
+from agents.nmpc.ipopt_agent import IpoptNmpc
+from agents.nmpc.rti_agent import RtiNmpc
+from agents.nmpc.settings import NmpcSettings
+from agents.registry import agent_class
+from agents.weight_tuning.agent import TunedNmpc
+from agents.weights import TrackingWeights, WeightSchedule
+from lpv_track_env.env import PathTrackingEnv
+from trajectories import CurvatureBands
+
+SET = {"Q": [1, 1, 20, 20], "S": [5, 5, 100, 100], "R": [0.01, 1]}
+SCHEDULE = WeightSchedule(
+    CurvatureBands((0.02,), ("straight", "sharp")),
+    (TrackingWeights(), TrackingWeights(Q=(1, 1, 20, 20))),
+    slew=2.0,
+)
+SHARED = set(inspect.signature(NmpcSettings).parameters)
+
+
+@pytest.mark.parametrize("kind", [RtiNmpc, IpoptNmpc, FrozenLpvMpc, TunedNmpc])
+def test_signatures_list_the_shared_settings(kind: Any) -> None:
+    parameters = inspect.signature(kind).parameters
+    missing = {"selection"} if kind is TunedNmpc else set()
+    assert SHARED - set(parameters) == missing
+    assert not any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+    assert parameters["max_failures"].default == 10
+
+
+@pytest.mark.parametrize("name", ["lpv-nmpc", "lpv-nmpc-ipopt", "lpv-mpc-frozen", "lpv-nmpc-tuned"])
+def test_misspelt_settings_are_named(name: str) -> None:
+    env = PathTrackingEnv("T2")
+    with pytest.raises(ValueError, match=r"has no setting 'horizn'; known: .*nearest: horizon"):
+        agents.make(name, env, horizn=10)
+    kind: Any = agent_class(name)
+    with pytest.raises(TypeError, match="horizn"):
+        kind(DrivingTask.of(env), horizn=10)
+
+
+@pytest.mark.parametrize("name", ["lpv-nmpc", "lpv-nmpc-tuned"])
+def test_weights_as_mappings_are_the_weights_themselves(name: str) -> None:
+    env = PathTrackingEnv("T2")
+    observation, _ = env.reset(seed=0, options={"lateral_error": 0.3})
+    for mapping, weights in (
+        (SET, TrackingWeights(Q=(1, 1, 20, 20), S=(5, 5, 100, 100), R=(0.01, 1))),
+        ({"Q": (2, 2, 2, 2)}, TrackingWeights(Q=(2, 2, 2, 2))),
+        (SCHEDULE.as_dict(), SCHEDULE),
+    ):
+        kept = dict(mapping)
+        given, meant = (agents.make(name, env, weights=one) for one in (mapping, weights))
+        actions = [agent.predict(observation)[0] for agent in (given, meant)]
+        np.testing.assert_array_equal(*actions)
+        assert mapping == kept
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ({"Q": [1, 1, 20]}, "weights: Q needs 4 weights, not 3"),
+        ({"S": [1, 1, 20, -1]}, "weights: S must be finite and not negative"),
+        ({"R": [0.01, "heavy"]}, "weights: could not convert string to float: 'heavy'"),
+        ({"P": [1, 1, 1, 1]}, r"unknown matrix of weights 'P'; known: Q, S, R \(nearest: "),
+        ({**SCHEDULE.as_dict(), "weights": []}, "weights: 2 bands need as many sets, not 0"),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("name", ["lpv-nmpc", "lpv-nmpc-ipopt", "lpv-nmpc-tuned"])
+def test_bad_mappings_are_refused_in_one_line(
+    name: str, mapping: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message) as refused:
+        agents.make(name, PathTrackingEnv("T2"), weights=mapping)
+    assert "\n" not in str(refused.value)
+
+
+def test_other_settings_are_checked() -> None:
+    with pytest.raises(ValueError, match=r"selection must be 'band' or 'path', not 'bands'"):
+        NmpcSettings(selection="bands")
+    with pytest.raises(ValueError, match="weights must be weights, a schedule or its file, not"):
+        NmpcSettings(weights=3)  # type: ignore[arg-type]
