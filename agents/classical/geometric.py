@@ -6,34 +6,23 @@ constant curvature then leaves no error.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from agents.base import DrivingTask, TrackingAgent
-from agents.classical.longitudinal import SpeedControl, SpeedMemory
-from agents.reference import (
-    early_turn,
-    lagged_sideslip,
-    local_reference,
-    mean_curvature,
-    point_at,
-    steady_turn,
-    transient_turn,
-)
+from agents.base import DrivingTask
+from agents.classical.base import ClassicalAgent, MotionMemory, NominalMotionAgent, SpeedMemory
+from agents.reference import LocalReference, mean_curvature, point_at, steady_turn
 from lpv_track_env.observation import TrackingObservation
 
 
 @dataclass
-class StanleyMemory:
+class StanleyMemory(MotionMemory):
     """Memory of `Stanley` for one vehicle."""
 
-    speed: SpeedMemory = field(default_factory=SpeedMemory)
-    sideslip: float = 0.0
-    """Nominal sideslip, rad."""
     steering_angle: float | None = None
     """Actual steering angle one period ago, rad."""
 
 
-class Stanley(TrackingAgent[StanleyMemory]):
+class Stanley(NominalMotionAgent[StanleyMemory]):
     """Stanley's steering law in its full form, for a centre of gravity on the path.
 
     With errors positive to the left and angles counter-clockwise::
@@ -78,54 +67,37 @@ class Stanley(TrackingAgent[StanleyMemory]):
         curvature_window: float = 1.0,
         early_turn_share: float = 0.6,
     ) -> None:
-        super().__init__(task)
+        super().__init__(task, curvature_window, early_turn_share)
         self.gain = gain
         self.softening_speed = softening_speed
         self.yaw_damping = yaw_damping
         self.steering_damping = steering_damping
-        self.curvature_window = curvature_window
-        self.rounding = early_turn_share * task.vehicle.max_steering_angle / task.vehicle.wheelbase
-        self.speed_control = SpeedControl(task)
 
     def new_memory(self) -> StanleyMemory:
         """Return the memory of a vehicle that begins without sideslip."""
         return StanleyMemory()
 
-    def control(
-        self, observation: TrackingObservation, memory: StanleyMemory
-    ) -> tuple[float, float]:
-        """Return acceleration (m/s^2) and steering angle (rad) for one observation."""
-        vehicle, period = self.task.vehicle, self.task.control_period
-        reference = local_reference(observation, self.task.layout.preview_period)
+    def steering(
+        self, observation: TrackingObservation, reference: LocalReference, memory: StanleyMemory
+    ) -> float:
+        """Return the steering angle (rad) for one observation."""
         vx, in_force = float(observation.longitudinal_speed), float(observation.steering_angle)
-
-        early = early_turn(reference, self.rounding)
-        curvature = early.curvature or mean_curvature(reference, 0.0, self.curvature_window)
-        turn = steady_turn(curvature, vx, vehicle)
-        nominal = transient_turn(turn, memory.sideslip, vx, vehicle)
-        memory.sideslip = lagged_sideslip(turn, memory.sideslip, vx * period, vehicle)
+        nominal, lateral_error, heading_error = self.motion(observation, reference, memory)
         last = in_force if memory.steering_angle is None else memory.steering_angle
         memory.steering_angle = in_force
-
-        heading_error = float(observation.heading_error) - early.heading  # e_psi
-        lateral_error = float(observation.lateral_error) - early.lateral_offset  # e_y
-        front_error = lateral_error + vehicle.front_axle_distance * (
+        front_error = lateral_error + self.task.vehicle.front_axle_distance * (
             math.sin(heading_error) + math.sin(nominal.sideslip)
         )
-        steering = (
+        return (
             nominal.steering_angle
             - (heading_error + nominal.sideslip)
             - math.atan(self.gain * front_error / (self.softening_speed + abs(vx)))
             - self.yaw_damping * (float(observation.yaw_rate) - nominal.yaw_rate)
             - self.steering_damping * (in_force - last)
         )
-        acceleration = self.speed_control.acceleration(
-            observation, reference, steering, memory.speed
-        )
-        return acceleration, steering
 
 
-class PurePursuit(TrackingAgent[SpeedMemory]):
+class PurePursuit(ClassicalAgent[SpeedMemory]):
     """Pure pursuit: steer the rear axle on an arc to a point ahead.
 
     ::
@@ -159,20 +131,22 @@ class PurePursuit(TrackingAgent[SpeedMemory]):
         lookahead_wheelbases: float = 1.5,
         curvature_window: float = 1.0,
     ) -> None:
-        super().__init__(task)
+        super().__init__(task, curvature_window)
         self.lookahead_time = lookahead_time
-        self.curvature_window = curvature_window
         self.minimum_lookahead = lookahead_wheelbases * task.vehicle.wheelbase
-        self.speed_control = SpeedControl(task)
 
     def new_memory(self) -> SpeedMemory:
         """Return the memory of the speed control; the steering has none."""
         return SpeedMemory()
 
-    def control(self, observation: TrackingObservation, memory: SpeedMemory) -> tuple[float, float]:
-        """Return acceleration (m/s^2) and steering angle (rad) for one observation."""
+    def steering(
+        self,
+        observation: TrackingObservation,
+        reference: LocalReference,
+        memory: SpeedMemory,  # noqa: ARG002
+    ) -> float:
+        """Return the steering angle (rad) for one observation."""
         vehicle = self.task.vehicle
-        reference = local_reference(observation, self.task.layout.preview_period)
         vx, heading_error = float(observation.longitudinal_speed), float(observation.heading_error)
         lr = vehicle.rear_axle_distance
         lookahead = max(self.minimum_lookahead, self.lookahead_time * abs(vx))
@@ -197,6 +171,4 @@ class PurePursuit(TrackingAgent[SpeedMemory]):
         travel = heading_error + here.rear_slip
         across = left * math.cos(travel) - ahead * math.sin(travel)  # d sin(alpha)
         curvature = 2.0 * across / distance**2
-        steering = curvature * (vehicle.wheelbase + vehicle.understeer_gradient * vx * vx)
-        acceleration = self.speed_control.acceleration(observation, reference, steering, memory)
-        return acceleration, steering
+        return curvature * (vehicle.wheelbase + vehicle.understeer_gradient * vx * vx)

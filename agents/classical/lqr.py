@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
-from agents.base import DrivingTask, TrackingAgent
-from agents.classical.longitudinal import SpeedControl, SpeedMemory
-from agents.reference import local_reference, mean_curvature, steady_turn
+from agents.base import DrivingTask
+from agents.classical.base import ClassicalAgent, SpeedMemory
+from agents.reference import LocalReference, mean_curvature, steady_turn
 from lpv_track_env import lpv
 from lpv_track_env.bicycle import VY, YAW_RATE
 from lpv_track_env.observation import TrackingObservation
@@ -98,7 +98,7 @@ def preview_gains(model: LateralModel, cost: Array, effort: float, count: int) -
     return Gains(feedback, preview)
 
 
-class LpvLqr(TrackingAgent[SpeedMemory]):
+class LpvLqr(ClassicalAgent[SpeedMemory]):
     """Linear-quadratic steering with preview, its gains scheduled over the speed.
 
     For every speed of a grid the gains minimise, over an infinite horizon with known curvature,
@@ -141,11 +141,9 @@ class LpvLqr(TrackingAgent[SpeedMemory]):
         speed_step: float = 0.5,
         curvature_window: float = 1.0,
     ) -> None:
-        super().__init__(task)
+        super().__init__(task, curvature_window)
         self.approach_angle = approach_angle
         self.slowest = speed_step
-        self.curvature_window = curvature_window
-        self.speed_control = SpeedControl(task)
         layout, period = task.layout, task.control_period
         self.count = max(round(layout.preview_steps * layout.preview_period / period), 1)
         forward = speed_step * np.arange(1, round(task.vehicle.speed_range[1] / speed_step) + 1)
@@ -175,9 +173,13 @@ class LpvLqr(TrackingAgent[SpeedMemory]):
         row = (1.0 - share) * self.table[k - 1] + share * self.table[k]
         return Gains(row[:STATES], row[STATES:])
 
-    def control(self, observation: TrackingObservation, memory: SpeedMemory) -> tuple[float, float]:
-        """Return acceleration (m/s^2) and steering angle (rad) for one observation."""
-        reference = local_reference(observation, self.task.layout.preview_period)
+    def steering(
+        self,
+        observation: TrackingObservation,
+        reference: LocalReference,
+        memory: SpeedMemory,  # noqa: ARG002
+    ) -> float:
+        """Return the steering angle (rad) for one observation."""
         vx, in_force = float(observation.longitudinal_speed), float(observation.steering_angle)
         # Mean curvature over the stretch of path driven in each of the next periods.
         stretch = max(vx, self.slowest) * self.task.control_period
@@ -199,9 +201,7 @@ class LpvLqr(TrackingAgent[SpeedMemory]):
         farthest = self.approach_angle * abs(float(gains.feedback[2] / gains.feedback[0]))
         state[0] = min(max(float(state[0]), -farthest), farthest)
         change = -float(gains.feedback @ state) - float(gains.preview @ ahead)
-        steering = in_force + change
-        acceleration = self.speed_control.acceleration(observation, reference, steering, memory)
-        return acceleration, steering
+        return in_force + change
 
     def _nonlinearity(self, curvature: float, speed: float) -> Array:
         """Return the steady state z (5,) on a circle, the bicycle's minus the linear model's."""

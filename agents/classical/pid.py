@@ -1,28 +1,18 @@
 """PID steering on the lateral error at a point ahead, with curvature feedforward."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from agents.base import DrivingTask, TrackingAgent
-from agents.classical.longitudinal import SpeedControl, SpeedMemory
-from agents.reference import (
-    early_turn,
-    lagged_sideslip,
-    local_reference,
-    mean_curvature,
-    steady_turn,
-    transient_turn,
-)
+from agents.base import DrivingTask
+from agents.classical.base import MotionMemory, NominalMotionAgent
+from agents.reference import LocalReference
 from lpv_track_env.observation import TrackingObservation
 
 
 @dataclass
-class PidMemory:
+class PidMemory(MotionMemory):
     """Memory of `Pid` for one vehicle."""
 
-    speed: SpeedMemory = field(default_factory=SpeedMemory)
-    sideslip: float = 0.0
-    """Nominal sideslip, rad."""
     integral: float = 0.0
     """Integral part, m (the unit of the error)."""
     error: float | None = None
@@ -31,7 +21,7 @@ class PidMemory:
     """Low-pass filtered rate of the error, m/s."""
 
 
-class Pid(TrackingAgent[PidMemory]):
+class Pid(NominalMotionAgent[PidMemory]):
     """PID steering with gains scheduled on the vehicle and its speed.
 
     ::
@@ -83,7 +73,7 @@ class Pid(TrackingAgent[PidMemory]):
         curvature_window: float = 1.0,
         early_turn_share: float = 0.6,
     ) -> None:
-        super().__init__(task)
+        super().__init__(task, curvature_window, early_turn_share)
         self.lookahead_time = lookahead_time
         self.shortest_lookahead = lookahead_wheelbases * task.vehicle.wheelbase
         self.damping = damping
@@ -91,29 +81,20 @@ class Pid(TrackingAgent[PidMemory]):
         self.derivative_time = derivative_time
         self.filter_time = filter_time
         self.approach_angle = approach_angle
-        self.curvature_window = curvature_window
-        self.rounding = early_turn_share * task.vehicle.max_steering_angle / task.vehicle.wheelbase
-        self.speed_control = SpeedControl(task)
 
     def new_memory(self) -> PidMemory:
         """Return the memory of a vehicle without sideslip, its integrators empty."""
         return PidMemory()
 
-    def control(self, observation: TrackingObservation, memory: PidMemory) -> tuple[float, float]:
-        """Return acceleration (m/s^2) and steering angle (rad) for one observation."""
+    def steering(
+        self, observation: TrackingObservation, reference: LocalReference, memory: PidMemory
+    ) -> float:
+        """Return the steering angle (rad) for one observation."""
         vehicle, period = self.task.vehicle, self.task.control_period
-        reference = local_reference(observation, self.task.layout.preview_period)
         vx = float(observation.longitudinal_speed)
-
-        early = early_turn(reference, self.rounding)
-        curvature = early.curvature or mean_curvature(reference, 0.0, self.curvature_window)
-        turn = steady_turn(curvature, vx, vehicle)
-        nominal = transient_turn(turn, memory.sideslip, vx, vehicle)
-        memory.sideslip = lagged_sideslip(turn, memory.sideslip, vx * period, vehicle)
+        nominal, lateral_error, heading_error = self.motion(observation, reference, memory)
 
         lookahead = self.shortest_lookahead + self.lookahead_time * abs(vx)
-        heading_error = float(observation.heading_error) - early.heading
-        lateral_error = float(observation.lateral_error) - early.lateral_offset
         farthest = self.approach_angle * lookahead
         error = min(max(lateral_error, -farthest), farthest)
         error += lookahead * math.sin(heading_error + nominal.sideslip)
@@ -129,10 +110,7 @@ class Pid(TrackingAgent[PidMemory]):
             error + memory.integral + self.derivative_time * memory.error_rate
         )
         self._integrate(observation, steering, error, memory)
-        acceleration = self.speed_control.acceleration(
-            observation, reference, steering, memory.speed
-        )
-        return acceleration, steering
+        return steering
 
     def _integrate(
         self, observation: TrackingObservation, steering: float, error: float, memory: PidMemory
