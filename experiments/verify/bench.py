@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,7 +13,8 @@ from agents.base import DrivingTask
 from agents.nmpc.casadi_solvers import FatropSolver, IpoptSolver
 from agents.nmpc.ipopt_agent import IpoptNmpc
 from agents.nmpc.linearisation import Linearisation
-from agents.nmpc.problem import NmpcProblem, Solution, Status
+from agents.nmpc.problem import Solution, Status
+from agents.nmpc.rti_solver import RtiSolver
 from agents.reference import steady_turn
 from agents.registry import agent_class
 from agents.weights import TrackingWeights
@@ -136,34 +137,6 @@ class Sampler:
             observation[entries[name]] = value
 
 
-class RealTimeSolver(Protocol):
-    """Solver under test, made by `cls(problem, iterations=...)`."""
-
-    problem: NmpcProblem
-    damping: tuple[float, float]
-
-    def solve(
-        self,
-        state: Array,
-        last_input: Array,
-        reference: Array,
-        weights: Array,
-        warm: Any = None,
-    ) -> tuple[Solution, Any]:
-        """Do up to `iterations` iterations; as `IpoptSolver.solve`."""
-        ...
-
-    def linearise(self, state: Array, inputs: Array) -> Linearisation:
-        """Roll the inputs (N, 2) out from a state (6,); return a Linearisation."""
-        ...
-
-    def solve_qp(
-        self, state: Array, last_input: Array, reference: Array, weights: Array, inputs: Array
-    ) -> tuple[Status, Array]:
-        """Solve one QP linearised along `inputs` (N, 2); return its optimal inputs (N, 2)."""
-        ...
-
-
 class Bench:
     """Solver under test and oracles for one vehicle.
 
@@ -172,7 +145,9 @@ class Bench:
     vehicle
         Name of a preset.
     solver
-        "module:Class" (or "file.py:Class") of the solver under test.
+        "module:Class" (or "file.py:Class") of the solver under test: a class made by
+        `cls(problem, iterations=...)` with the `problem`, `damping`, `solve`, `linearise` and
+        `solve_qp` of `RtiSolver`.
 
     Raises
     ------
@@ -186,8 +161,8 @@ class Bench:
         cls = agent_class(solver)
         self.sampler = Sampler(vehicle)
         self.problem = problem = self.sampler.agent.problem
-        self.one_step: RealTimeSolver = cls(problem, iterations=1)
-        self.converged: RealTimeSolver = cls(problem, iterations=ITERATIONS)
+        self.one_step: RtiSolver = cls(problem, iterations=1)
+        self.converged: RtiSolver = cls(problem, iterations=ITERATIONS)
         self.derivatives = CasadiDerivatives(problem)
         self.piqp = PiqpOracle(problem, self.one_step.damping)
         self.ipopt = self.sampler.ipopt
