@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +18,7 @@ from experiments.commands.options import (
     agent_settings,
     conditions_of,
 )
-from experiments.run.provenance import hardware, revision, versions
+from experiments.run.provenance import load_average, measured_on
 
 if TYPE_CHECKING:
     from experiments.parallel.recording import Outcome, Summary
@@ -83,7 +82,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from experiments.parallel.recording import summarise
 
     file = options.out / RUN_FILE
-    result = {**_provenance(), "settings": setup.as_dict()}
+    result = {"format": FORMAT, **measured_on(), "settings": setup.as_dict()}
     _write(result, file)
 
     def say(line: str) -> None:
@@ -92,7 +91,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     outcome = supervisor.run(setup, say)
     summary = summarise(setup, outcome)
-    result["machine"]["load_average_after"] = _load()
+    result["machine"]["load_average_after"] = load_average()
     result["run"] = summary
     _write(result, file)
     figure = report.draw(setup, outcome, summary, trajectories.load(setup.trajectory))
@@ -131,28 +130,12 @@ def _bench(folder: Path, console: Console) -> int:
     """Measure the mailbox, print a table, write `mailbox.json`; return the exit code."""
     from experiments.parallel.bench import bench_mailbox
 
-    result = _provenance()
+    result = {"format": FORMAT, **measured_on()}
     _write(result, folder / MAILBOX_FILE)
     result["mailbox"] = bench_mailbox(console)
-    result["machine"]["load_average_after"] = _load()
+    result["machine"]["load_average_after"] = load_average()
     _write(result, folder / MAILBOX_FILE)
     return 0
-
-
-def _provenance() -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "machine": {
-            **hardware(), "versions": versions(), "revision": revision(),
-            "load_average_before": _load(), "load_average_after": None,
-        },
-    }  # fmt: skip
-
-
-def _load() -> list[float] | None:
-    """Return the load average over 1, 5 and 15 minutes, where the system has it."""
-    return list(os.getloadavg()) if hasattr(os, "getloadavg") else None
 
 
 def _write(result: dict[str, Any], file: Path) -> None:

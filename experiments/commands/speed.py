@@ -4,7 +4,6 @@ import argparse
 import importlib
 import json
 import os
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -120,12 +119,13 @@ def _measure_all(
 
 def _measure(name: str, result: dict[str, Any], effort: "Effort", tick: "Tick") -> None:
     """Measure a section into the result; an interrupted section keeps its finished rounds."""
+    from experiments.run.provenance import load_average
     from experiments.speed.measure import Section
 
     module, title = SECTIONS[name]
     measure = getattr(importlib.import_module(f"experiments.speed.{module}"), name)
     section = Section(title)
-    before, began = _load_average(), time.perf_counter()
+    before, began = load_average(), time.perf_counter()
     try:
         measure(section, effort, tick)
     finally:
@@ -138,38 +138,28 @@ def _measure(name: str, result: dict[str, Any], effort: "Effort", tick: "Tick") 
 
 def _empty(effort: "Effort", chosen: Sequence[str], *, quick: bool) -> dict[str, Any]:
     """Return the content of `speed.json` before the first section."""
-    from experiments.run.provenance import hardware, revision, versions
+    from experiments.run.provenance import measured_on
 
-    return {
+    result = {
         "format": FORMAT,
         "written": None,
         "complete": False,
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "settings": {"quick": quick, "sections": list(chosen), **asdict(effort)},
-        "machine": {
-            **hardware(),
-            "versions": versions(*PEERS),
-            "revision": revision(),
-            "threads": {
-                name: os.environ[name] for name in sorted(os.environ) if name.endswith("_THREADS")
-            },
-            "load_average_before": _load_average(),
-            "load_average_after": None,
-        },
+        **measured_on(*PEERS),
         "sections": {},
     }
-
-
-def _load_average() -> list[float] | None:
-    """Return the load average over 1, 5 and 15 minutes, or None if the system has none."""
-    return list(os.getloadavg()) if hasattr(os, "getloadavg") else None
+    result["machine"]["threads"] = {
+        name: os.environ[name] for name in sorted(os.environ) if name.endswith("_THREADS")
+    }
+    return result
 
 
 def _write(result: dict[str, Any], folder: Path) -> None:
     """Write `speed.json`."""
+    from experiments.run.provenance import load_average
     from trajectories.fileio import write_atomically
 
     result["written"] = datetime.now(UTC).isoformat(timespec="seconds")
-    result["machine"]["load_average_after"] = _load_average()
+    result["machine"]["load_average_after"] = load_average()
     content = json.dumps(result, indent=1, allow_nan=False)
     write_atomically(folder / "speed.json", content.encode() + b"\n")

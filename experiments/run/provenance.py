@@ -1,10 +1,11 @@
-"""What a written result carries to be reproduced: revision, versions, hardware, digests."""
+"""Entries of a written result that make it reproducible: revision, versions, hardware, load."""
 
 import hashlib
 import importlib.metadata
 import os
 import platform
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,34 @@ PACKAGES = (
 def provenance() -> dict[str, Any]:
     """Return `revision`, `versions` and `hardware`, the entries of every written result."""
     return {"revision": revision(), "versions": versions(), "hardware": hardware()}
+
+
+def measured_on(*further: str) -> dict[str, Any]:
+    """Return `command` and `machine`, the entries of a result that depends on speed.
+
+    `machine` has hardware, versions (see `versions`), revision and the load average before; the
+    load average after is None until the measurement has ended.
+    """
+    return {
+        "command": command_line(),
+        "machine": {
+            **hardware(),
+            "versions": versions(*further),
+            "revision": revision(),
+            "load_average_before": load_average(),
+            "load_average_after": None,
+        },
+    }
+
+
+def command_line() -> list[str]:
+    """Return the words of the running command, its program without folders."""
+    return [Path(sys.argv[0]).name, *sys.argv[1:]]
+
+
+def load_average() -> list[float] | None:
+    """Return the load average over 1, 5 and 15 minutes, or None if the system has none."""
+    return list(os.getloadavg()) if hasattr(os, "getloadavg") else None
 
 
 def revision() -> dict[str, Any]:

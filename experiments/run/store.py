@@ -8,7 +8,6 @@ counts, and files are replaced atomically.
 import io
 import json
 import os
-import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.run.provenance import provenance
+from experiments.run.provenance import command_line, provenance
 from trajectories.fileio import write_atomically
 
 Array = NDArray[np.float64]
@@ -107,7 +106,7 @@ class ResultStore:
         manifest = {
             "format": "lpv-track-results/1",
             "written": datetime.now(UTC).isoformat(timespec="seconds"),
-            "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+            "command": command_line(),
             "settings": dict(settings),
             **provenance(),
         }
