@@ -1,5 +1,6 @@
-"""`lpv-track drive`: watch a run live, write frames or a video, agents side by side."""
+"""Drives with their pictures: step by step, agents side by side, into a window, files or a video."""
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,27 +11,28 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from experiments.agent_words import agent_notes, world_plan
+from agents.weights import in_words
 from experiments.run.case import BaseCase
 from experiments.run.engines import Interrupts
 from experiments.run.rollout import Rollout, steps
-from experiments.sinks import PngSink, Sink, VideoSink, WindowSink
+from experiments.sinks import Frame, PngSink, Sink, VideoSink, WindowSink
+from lpv_track_env.bicycle import PSI, X, Y
 
-Frame = NDArray[np.uint8]
+Array = NDArray[np.float64]
 
 SEAM = (224, 228, 234)
 """Colour of the line between frames side by side."""
 
 
 class Drive:
-    """One agent's drive of a case, step by step, and its picture.
+    """A case that is driven step by step, and its picture.
 
     Parameters
     ----------
     case
-        What is driven.
+        The case.
     colour
-        What the path is coloured by, see `lpv_track_env.rendering.Renderer`.
+        Quantity that colours the path, see `lpv_track_env.rendering.Renderer`.
     """
 
     def __init__(self, case: BaseCase, colour: str) -> None:
@@ -41,16 +43,16 @@ class Drive:
         self._steps: Iterator[tuple[int, dict[str, Any]]] = self._drive(agent)
         self._frame: Frame | None = None
         self.done: Rollout | None = None
-        """Once it has ended."""
+        """Outcome of the drive once it has ended."""
 
     @property
     def expected_steps(self) -> int:
-        """Steps that the reference itself would take."""
+        """Number of control periods that the reference takes."""
         return max(round(float(self._inner.path.duration / self._inner.control_period)), 1)
 
     @property
     def finished(self) -> bool:
-        """Whether it has come to the end of the path."""
+        """True once the drive has reached the end of the path."""
         return self.done is not None and self.done.end == "finished"
 
     def _drive(self, agent: Any) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -59,7 +61,7 @@ class Drive:
         )
 
     def advance(self) -> bool:
-        """Drive one control period; False once the episode has ended."""
+        """Drive one control period and return True, or False once the episode has ended."""
         for _, info in self._steps:
             self._frame = None
             self._inner.show_agent(world_plan(info), agent_notes(self.case.agent, info))
@@ -67,13 +69,13 @@ class Drive:
         return False
 
     def frame(self) -> Frame:
-        """The picture now, (600, 900, 3); of a drive that has ended, the last."""
+        """Return the present picture (600, 900, 3), the last one after the end of the drive."""
         if self._frame is None:
             self._frame = self._inner.render()
         return self._frame
 
     def close(self) -> None:
-        """Free what drawing took."""
+        """Close the environment and its drawing."""
         self._env.close()
 
 
@@ -106,12 +108,12 @@ def drive(
         at most 50) and how many times faster than the drive it runs. Its last frame stays for a
         second.
     colour
-        What the path is coloured by: "speed" or "curvature".
+        Quantity that colours the path: "speed" or "curvature".
 
     Raises
     ------
     ValueError
-        If `every`, `fps` or `speed_up` make no sense, both frames and a video are asked for, or
+        If `every`, `fps` or `speed_up` are out of range, both frames and a video are asked for, or
         there is nothing to draw on.
     ModuleNotFoundError
         In one line that names the extra to install, for a video without an encoder.
@@ -120,7 +122,7 @@ def drive(
     for one in cases:
         one.check()
     with ExitStack() as stack:
-        # First of all, so that what drawing lacks is told at once.
+        # First of all, so that a missing display or encoder is reported at once.
         stack.enter_context(sink)
         drives = [Drive(one, colour) for one in cases]
         for driven in drives:
@@ -131,16 +133,16 @@ def drive(
                 interrupts.check()
                 progress.advance(bar)
     for driven in drives:
-        _tell(driven, console)
+        _print_outcome(driven, console)
     if sink.outcome:
         console.print(sink.outcome, markup=False, highlight=False, soft_wrap=True)
     return 0 if all(driven.finished for driven in drives) else 1
 
 
 def play(drives: Sequence[Drive], sink: Sink) -> Iterator[int]:
-    """Drive all of them into a sink, until the last has ended; yields each step's number."""
+    """Drive all of them into a sink until the last has ended; yield each step's number."""
     step = 0
-    # A list, not a generator: every one of them is to be driven.
+    # A list, not a generator, so that every one is driven.
     while any([one.advance() for one in drives]):  # noqa: C419
         step += 1
         if times := sink.copies(step):
@@ -149,8 +151,44 @@ def play(drives: Sequence[Drive], sink: Sink) -> Iterator[int]:
     sink.end(lambda: beside([one.frame() for one in drives]))
 
 
+def world_plan(info: dict[str, Any]) -> Array | None:
+    """Return an agent's predicted positions (n, 2) m in the world; None without a plan.
+
+    The plan is in the frame of the foot point of the step that has just been driven. It is moved so
+    that it starts at the vehicle's present position.
+    """
+    plan = info.get("agent", {}).get("plan")
+    if plan is None or len(plan) < 3:
+        return None
+    state = info["state"]
+    heading = state[PSI] - info["heading_error"]
+    c, s = math.cos(heading), math.sin(heading)
+    ahead = np.asarray(plan)[1:] - np.asarray(plan)[1]
+    return np.column_stack(
+        [state[X] + c * ahead[:, 0] - s * ahead[:, 1], state[Y] + s * ahead[:, 0] + c * ahead[:, 1]]
+    )
+
+
+def agent_notes(name: str, info: dict[str, Any]) -> dict[str, str]:
+    """Return notes for the picture by label: the agent's name, its last solve, its weights.
+
+    They do not depend on the speed of the computer, so that equal drives give equal frames.
+    """
+    notes, told = {"agent": name}, info.get("agent", {})
+    if "status" in told:
+        count = told["iterations"]
+        notes["solver"] = f"{told['status']}, {count} iteration{'' if count == 1 else 's'}"
+        # A row in any case, so that the card keeps its size.
+        notes["fallback"] = told.get("fallback") or "none"
+    if told.get("weights") is not None:
+        notes |= in_words(told["weights"])
+    if info.get("stopping"):
+        notes["vehicle"] = "brakes by itself"
+    return notes
+
+
 def beside(frames: Sequence[Frame]) -> Frame:
-    """Frames (height, width, 3) side by side, a thin line between them."""
+    """Return frames (height, width, 3) side by side with a thin line between them."""
     if len(frames) == 1:
         return frames[0]
     picture: Frame = np.concatenate(frames, axis=1)
@@ -164,7 +202,7 @@ def _sink(
     period: float, frames: Path | None, every: int, video: Path | None, fps: float | None,
     speed_up: float,
 ) -> Sink:  # fmt: skip
-    """Where the frames go, as `drive` is told."""
+    """Make the sink that the arguments of `drive` ask for."""
     if every < 1:
         raise ValueError(f"--every must be at least 1, not {every}")
     if frames is not None and video is not None:
@@ -186,7 +224,7 @@ def _progress(console: Console, *, live: bool) -> Progress:
     )  # fmt: skip
 
 
-def _tell(one: Drive, console: Console) -> None:
+def _print_outcome(one: Drive, console: Console) -> None:
     assert one.done is not None
     trace = one.done.trace
     worst = float(np.abs(trace.lateral_error).max())

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.agent_words import agent_notes, world_plan
+from experiments.drive import agent_notes, world_plan
 from experiments.run.case import Case
 from experiments.run.rollout import steps
 from experiments.speed.measure import Effort, Run, Section, Tick, calibrated, interleave, module

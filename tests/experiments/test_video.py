@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 
 from agents.weights import in_words
 from experiments import drive, sinks
-from experiments.agent_words import agent_notes
 from experiments.cli import main
-from experiments.drive import beside
-from experiments.sinks import VideoSink
-from experiments.video import Video
+from experiments.drive import agent_notes, beside
+from experiments.sinks import Video, VideoSink
 
 Frame = NDArray[np.uint8]
 SIZE = (120, 80)
