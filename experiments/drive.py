@@ -1,4 +1,4 @@
-"""Drives with their pictures: step by step, agents side by side, into a window, files or a video."""
+"""Drives with pictures: agents side by side, shown in a window or written as files or a video."""
 
 import math
 from collections.abc import Iterator, Sequence

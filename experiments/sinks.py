@@ -25,7 +25,7 @@ MOST_FPS = 50.0
 """Default limit on the frames a second of a video; players of .gif take no more."""
 MISSING = "videos need an encoder: pip install 'lpv-track-env[video]'"
 ENCODINGS = {
-    # Plays everywhere; the index comes first, so that a browser starts before it has the whole file.
+    # Plays everywhere; the index comes first, so that browsers start before they have it all.
     ".mp4": ("-vcodec", "libx264", "-preset", "veryfast", "-crf", "18", "-pix_fmt", "yuv420p",
              "-movflags", "+faststart", "-f", "mp4"),
     # A palette for every frame: a common one would have to keep all frames.
