@@ -71,19 +71,7 @@ def prepared(setup: Setup) -> "Controller":
 
 
 class Controller:
-    """Commands of an agent, estimate by estimate.
-
-    Parameters
-    ----------
-    agent
-        Anything with `predict`.
-    observer
-        Computes the agent's observations from estimates.
-    vehicle
-        Vehicle, for the deceleration that stops it.
-    setup
-        Settings of the run.
-    """
+    """Commands of an agent to the vehicle, estimate by estimate."""
 
     def __init__(
         self, agent: Agent, observer: PathObserver, vehicle: VehicleParameters, setup: Setup

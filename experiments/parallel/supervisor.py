@@ -42,14 +42,7 @@ Say = Callable[[str], None]
 
 
 def run(setup: Setup, say: Say) -> Outcome:
-    """Drive one run; no process and no shared memory is left on return.
-
-    Parameters
-    ----------
-    setup
-        Settings of the run.
-    say
-        Function that prints a line for the user.
+    """Drive one run, printing through `say`; no process and no shared memory is left on return.
 
     Raises
     ------

@@ -61,11 +61,6 @@ class Vehicle:
     A command is valid until the estimate behind it is three control periods old on the vehicle's
     own clock. Then the vehicle brakes with the steering held, at a controlled deceleration down to
     standstill, until a valid command arrives.
-
-    Parameters
-    ----------
-    setup
-        Settings of the run.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -178,14 +173,7 @@ class Vehicle:
 class Sensors:
     """Sensors of the vehicle, each at its own rate, with the errors of `lpv_track_env.sensors`.
 
-    Parameters
-    ----------
-    conditions
-        Conditions of the sensors; None for perfect ones.
-    fix_ms
-        Time between fixes, ms.
-    seed
-        Seed of all draws.
+    Without conditions they are perfect; `fix_ms` (ms) is the time between fixes.
     """
 
     def __init__(self, conditions: Conditions | None, fix_ms: int, seed: int) -> None:

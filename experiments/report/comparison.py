@@ -89,18 +89,8 @@ def by_agent(
 ) -> list[Panel]:
     """Return a panel per trajectory, a line per agent, a mark with interval per conditions.
 
-    Parameters
-    ----------
-    rows
-        Agents' rows with a value of `key`.
-    conditions
-        Conditions of each setting in words.
-    styles
-        Styles of the conditions, in their order.
-    words
-        Label of the axis.
-    key
-        Column to draw, m or rad; its published value is a line across the panel.
+    It draws the value `key` (m or rad) of agents' rows, on an axis labelled `words`; the published
+    value is a line across the panel. `conditions` are those of each setting in words.
     """
     panels = []
     for name in dict.fromkeys(row.trajectory for row in rows):

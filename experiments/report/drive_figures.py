@@ -94,12 +94,7 @@ def _plan(
 def reference_chart(group: Sequence[Drive], driven: Sequence[Array]) -> Chart:
     """Return a chart from above with the reference as a broad line and its start as a disc.
 
-    Parameters
-    ----------
-    group
-        Drives on one trajectory.
-    driven
-        X, Y, X, Y, ... (m) of the lines to be drawn on it, for its scales.
+    Its scales fit the lines to be drawn on it: `driven` holds their X, Y, X, Y, ... (m).
     """
     x, y = reference_line(group)
     every = (

@@ -178,17 +178,10 @@ class Document:
             self.sections.append((title, content, "" if printed else ' class="screen"'))
 
     def render(self, title: str, subtitle: str, scripts: Sequence[str] = ()) -> str:
-        """Return the whole page as text.
+        """Return the whole page as text, with further `scripts` from files in this folder.
 
         The page's policy forbids all requests and all scripts but its own, which it identifies by
         their digests: nothing in a results folder can run.
-
-        Parameters
-        ----------
-        title, subtitle
-            Unescaped text.
-        scripts
-            Names of further script files in this folder.
         """
         sources = [asset(name) for name in (*SCRIPTS, *scripts)]
         digests = [

@@ -44,14 +44,7 @@ Tile = tuple[str, str, str]
 def summary_section(document: Document, cases: Sequence[Result], superseded: int) -> str:
     """Return key findings as tiles, then a table with a line for each agent of each setting.
 
-    Parameters
-    ----------
-    document
-        Page to number the tables.
-    cases
-        Results to report.
-    superseded
-        Number of results left out because later ones repeat their cases.
+    `superseded` is the number of results left out because later ones repeat their cases.
     """
     parts = [tiles([*findings(cases), *counts(cases)])]
     if superseded:

@@ -1,4 +1,4 @@
-"""`lpv-track ablation` and `lpv-track latency`, tiny, through their own entry."""
+"""`lpv-track ablation` and `lpv-track latency`, on tiny cases."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The mailbox between processes: newest value, never a torn one, no wait without an end."""
+"""The mailbox between processes: newest value, never a torn one, no endless wait."""
 
 import multiprocessing
 import os
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pipes that sele
 
 
 def record(number: int) -> np.ndarray:
-    """A record whose parts betray one that was put together from two."""
+    """Return a record whose fields reveal a mixture of two values."""
     made = np.zeros((), RECORD)
     made["number"] = number
     made["values"] = number * np.arange(50)
@@ -96,7 +96,7 @@ def test_wait_all_has_those_in_between_and_numbers_tell_what_is_lost(mailbox: Ma
     assert mailbox.reader.wait_all(0.0) == []
 
 
-def test_a_watcher_looks_and_waits_without_a_pipe(mailbox: Mailbox) -> None:
+def test_a_passive_reader_waits_without_a_pipe(mailbox: Mailbox) -> None:
     watcher = mailbox.passive_reader().open()
     assert watcher.wait(0.01) is None
     mailbox.writer.put(record(7))
@@ -136,7 +136,7 @@ def test_a_write_cut_off_anywhere_leaves_the_value_before(slots: int) -> None:
         assert message is not None
         assert message.sequence == 5
         assert is_whole(message.value)
-        # As a processor may see it that does not keep the order of writes.
+        # A processor that does not keep the order of writes may see this.
         writer._front[0] = 6
         copy = reader._copy(6)
         assert (copy is not None) == (new[:cut] + old[cut:] == new)
@@ -171,7 +171,7 @@ def start_hammering(mailbox: Mailbox) -> multiprocessing.process.BaseProcess:
 
 
 def test_no_torn_value_under_a_hammering_writer_and_none_after_its_death() -> None:
-    mailbox = Mailbox(RECORD, slots=2)  # So that most looks have to be taken again.
+    mailbox = Mailbox(RECORD, slots=2)  # Most reads have to be repeated.
     reader = mailbox.reader.open()
     process = start_hammering(mailbox)
     last, read = 0, 0
@@ -185,7 +185,7 @@ def test_no_torn_value_under_a_hammering_writer_and_none_after_its_death() -> No
         last = message.sequence
         read += 1
     assert read > 10
-    # Killed wherever it is just then, most likely within a write.
+    # The kill most likely hits it within a write.
     os.kill(process.pid, signal.SIGKILL)
     process.join()
     message = reader.latest()
@@ -228,12 +228,12 @@ def test_the_name_is_gone_while_both_sides_go_on() -> None:
     with pytest.raises(FileNotFoundError):
         mailbox.passive_reader().open()
     mailbox.close()
-    mailbox.close()  # Once more does no harm.
+    mailbox.close()  # Closing twice has no effect.
 
 
 def test_the_bench_measures_every_value_that_was_taken() -> None:
     latencies = bench.measure("mailbox (pipe)", 30)
-    # A value that a busy machine's reader slept through is not among them.
+    # Values that the reader of a busy machine missed are left out.
     assert 1 <= len(latencies) <= 30
     assert (latencies > 0.0).all()
 

@@ -41,19 +41,19 @@ ROOT = Path(__file__).parents[3]
 AGENTS = Path(faulty_agents.__file__)
 SHARED = Path("/dev/shm")  # noqa: S108
 SLOW = Setup(trajectory="T2", agent="stanley", rate=20, seconds=1.0, watchdog=200)
-"""At a rate that a busy machine holds."""
+"""A run at a rate that a busy machine can hold."""
 BUS = VEHICLES["m2-minibus"]
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals")
 
 
 def left_behind(pid: int) -> list[str]:
-    """Shared memory of a supervisor's mailboxes."""
+    """Return the names of the shared memory of a supervisor's mailboxes."""
     return [file.name for file in SHARED.glob(f"lpv-track-{pid}-*")] if SHARED.is_dir() else []
 
 
 def ended(pid: int) -> bool:
-    """Whether a process, perhaps nobody's child, is gone (or dead and not yet buried)."""
+    """Return whether a process is gone or a zombie."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -65,12 +65,12 @@ def ended(pid: int) -> bool:
 
 
 def pids_in(line: str) -> dict[str, int]:
-    """Process ids by role, from the line that says that the clock runs."""
+    """Read the process ids by role from the line "processes: ..."."""
     return {name: int(pid) for name, pid in re.findall(r"(estimator|controller) (\d+)", line)}
 
 
-class Onlooker:
-    """Hears who the processes are, and does something to one of them after a while."""
+class Saboteur:
+    """Receives the run's first line, and sends a signal to one of its processes after a while."""
 
     def __init__(self, role: str = "", number: int = 0, after: float = 0.4) -> None:
         self.role, self.number, self.after = role, number, after
@@ -85,26 +85,25 @@ class Onlooker:
             self.timers[-1].start()
 
 
-def drive(setup: Setup, onlooker: Onlooker) -> Outcome:
-    """A run in this process, after which nothing may be left."""
-    outcome = run(setup, onlooker)
-    for timer in onlooker.timers:
+def drive(setup: Setup, saboteur: Saboteur) -> Outcome:
+    """Drive in this process and check that nothing is left."""
+    outcome = run(setup, saboteur)
+    for timer in saboteur.timers:
         timer.join()
-    assert len(onlooker.pids) == 2, outcome.fault
-    assert all(ended(pid) for pid in onlooker.pids.values())
+    assert len(saboteur.pids) == 2, outcome.fault
+    assert all(ended(pid) for pid in saboteur.pids.values())
     assert left_behind(os.getpid()) == []
     return outcome
 
 
 def assert_braked_in_time(setup: Setup, outcome: Outcome) -> None:
-    """By the vehicle's own clock it braked three periods after the last sample it had an answer to,
-    kept at it, and stood at the end."""
+    """Check that the vehicle braked to a stand three periods after its last answered sample."""
     assert outcome.stale_brakings
     for braking in outcome.stale_brakings:
         assert braking.age == pytest.approx(3.0 * setup.period, abs=1.1e-3)
     last = outcome.stale_brakings[-1]
     assert last.ended is None
-    # Before the first command it counts from the beginning.
+    # Before the first command, the age counts from the start.
     answered = max((row[0] for row in outcome.recording.commands), default=0)
     assert last.began <= (answered + 3) * setup.period + 1e-9
     assert outcome.final_speed < 0.02
@@ -112,7 +111,7 @@ def assert_braked_in_time(setup: Setup, outcome: Outcome) -> None:
 
 
 def test_a_run_to_its_end() -> None:
-    outcome = drive(SLOW, Onlooker())
+    outcome = drive(SLOW, Saboteur())
     assert (outcome.end, outcome.fault, outcome.signal) == ("seconds", "", 0)
     assert len(outcome.recording.rows) == 21
     applied = outcome.recording.applied()
@@ -121,7 +120,7 @@ def test_a_run_to_its_end() -> None:
     assert (applied["commanded"] <= applied["latency"]).all()
     assert (applied["estimated"] > 0.0).all()
     assert outcome.final_speed < 0.02
-    # It was driven: on the path, over about the distance of its speed.
+    # The vehicle followed the path over about the distance of its speed.
     driven = outcome.recording.driven()
     assert np.abs(driven.lateral_error).max() < 0.5
     assert driven.arc_length[-1] > 0.5 * driven.state[0, 0]
@@ -133,9 +132,9 @@ def test_a_run_to_its_end() -> None:
 
 @pytest.mark.parametrize("role", ["estimator", "controller"])
 def test_a_killed_process_brakes_the_vehicle_and_ends_the_run(role: str, capsys) -> None:
-    onlooker = Onlooker(role, signal.SIGKILL)
+    saboteur = Saboteur(role, signal.SIGKILL)
     setup = Setup(**{**SLOW.as_dict(), "seconds": 20.0})
-    outcome = drive(setup, onlooker)
+    outcome = drive(setup, saboteur)
     assert outcome.end == "fault"
     assert outcome.fault == f"the {role} was killed by SIGKILL"
     assert_braked_in_time(setup, outcome)
@@ -146,14 +145,14 @@ def test_a_killed_process_brakes_the_vehicle_and_ends_the_run(role: str, capsys)
 
 def test_a_hung_solver_is_found_by_the_watchdog() -> None:
     setup = Setup(**{**SLOW.as_dict(), "agent": f"{AGENTS}:Hangs", "watchdog": 20, "seconds": 20.0})
-    outcome = drive(setup, Onlooker())
+    outcome = drive(setup, Saboteur())
     assert outcome.end == "fault"
     assert re.fullmatch(r"the controller hangs: no command for \d+\.\d\d s", outcome.fault)
     assert_braked_in_time(setup, outcome)
 
 
 def started(*more: str) -> tuple[subprocess.Popen[str], dict[str, int], int]:
-    """The command as a process of its own, once its clock runs."""
+    """Start the command as a process and wait until its clock runs."""
     process = subprocess.Popen(
         [
             sys.executable, "-m", "experiments", "run-parallel", "--agent", "stanley",
@@ -244,7 +243,7 @@ def test_the_vehicle_brakes_when_left_alone_and_drives_on_when_not() -> None:
     vehicle.advance(1.0)
     assert vehicle.in_force[1] == pytest.approx(steering, abs=1e-6)
     assert vehicle.speed < speed - 1.0
-    # A command that answers something old does not count; a fresh one does.
+    # A command based on an old sample is stale; a fresh one is valid.
     assert vehicle.take(1.0, 0.0, 0.9)
     vehicle.advance(1.01)
     assert vehicle.braking is not None
@@ -252,7 +251,7 @@ def test_the_vehicle_brakes_when_left_alone_and_drives_on_when_not() -> None:
     vehicle.advance(1.02)
     assert vehicle.braking is None
     assert vehicle.stale_brakings[0].ended == pytest.approx(1.01)
-    # Left alone for good it comes to a stand and stays there.
+    # Without further commands it stops and stays stopped.
     vehicle.advance(12.0)
     assert abs(vehicle.speed) < 0.01
     assert len(vehicle.stale_brakings) == 2
@@ -274,7 +273,7 @@ def test_mean_inputs_are_those_since_last_asked() -> None:
     before = vehicle.in_force[0]
     assert vehicle.mean_inputs()[0] == pytest.approx(before)
     vehicle.take(before + 1.0, 0.0, 0.02)
-    vehicle.advance(0.03)  # It rises by the jerk limit, 5 mm/s^2 a ms: 1, 2, ... 10 of these.
+    vehicle.advance(0.03)  # Limited jerk: it rises by 5 mm/s^2 per ms.
     a, _ = vehicle.mean_inputs()
     assert a == pytest.approx(before + 5.5 * BUS.max_jerk * 1e-3)
     assert vehicle.in_force[0] == pytest.approx(before + 10.0 * BUS.max_jerk * 1e-3)
@@ -284,7 +283,7 @@ def test_mean_inputs_are_those_since_last_asked() -> None:
 
 
 class Constant:
-    """Answers the same always; raises or returns what is not finite when told to."""
+    """Agent with a constant action; a test may set the action or an error to raise."""
 
     def __init__(self) -> None:
         self.action = np.array([0.5, 0.1])
@@ -340,10 +339,10 @@ def test_the_controller_brakes_on_an_estimate_it_cannot_trust(
     assert controller.command["reason"] == reason
     assert float(controller.command["steering_angle"]) == 0.02
     known = reason != NOT_FINITE
-    # 2 m/s^2 beyond what rolls out, or, without a speed, rolling on.
+    # 2 m/s^2 more than rolling resistance; without a known speed, rolling.
     expected = BUS.rolling_deceleration - (2.0 if known else 0.0)
     assert float(controller.command["acceleration"]) == pytest.approx(expected)
-    # It goes on from there when the next is good.
+    # It drives again with the next valid estimate.
     controller.answer(an_estimate(controller), 6)
     assert controller.command["reason"] == DRIVING
 
@@ -359,7 +358,7 @@ def test_the_controller_finds_its_place_again_after_estimates_that_were_missed(
         estimate["state"] = [5.0, 0.0, here.heading, 0.0, here.x, here.y]
         estimate["fix_age"] = 3.0 if s == 20.2 else 0.0
         controller.answer(estimate, 1)
-        # Round a corner the way is longer than the distance, by less than is looked around.
+        # Round a corner the path is longer than the distance, within the range of the search.
         assert observer.arc_length == pytest.approx(s, abs=1e-3)
         assert observer.lateral_error == pytest.approx(0.0, abs=1e-3)
 
@@ -383,7 +382,7 @@ def test_the_controller_brakes_by_itself_when_no_estimate_comes(
         assert controller.command["due"] == now
         accelerations.append(float(controller.command["acceleration"]))
     assert accelerations[0] == pytest.approx(BUS.rolling_deceleration - 2.0)
-    # Over 8 s it has braked to a stand, by its own account.
+    # After 8 s its extrapolated speed is zero.
     assert accelerations[-1] == pytest.approx(BUS.rolling_deceleration, abs=1e-3)
 
 
@@ -440,7 +439,7 @@ def test_noise_latency_outages_and_outliers_are_those_of_the_conditions() -> Non
         yaw_rate_noise=0.004, yaw_rate_bias=-0.003, speed_noise=0.05, speed_scale=0.01,
     )  # fmt: skip
     found = readings(Sensors(noisy, 100, seed=1), 400_000, STATE)
-    several = 5.0 / math.sqrt(len(found))  # Of the deviation of a mean of so many.
+    several = 5.0 / math.sqrt(len(found))  # Standard deviations of a mean.
     for name, true, bias, deviation in (
         ("heading", 0.3, 0.02, 0.01),
         ("yaw_rate", 0.2, -0.003, 0.004),
@@ -452,7 +451,7 @@ def test_noise_latency_outages_and_outliers_are_those_of_the_conditions() -> Non
     there = np.flatnonzero(~np.isnan(found["fix_x"]))
     late = 0.01 * there[1:] - found["fix_time"][there[1:]]
     assert late == pytest.approx(0.13)
-    assert found["fix_time"][0] == 0.0  # The first is there at once: something to begin from.
+    assert found["fix_time"][0] == 0.0  # The first fix arrives at once, to start the filter.
     errors = np.hypot(found["fix_x"][there] - 100.0, found["fix_y"][there] + 50.0)
     wild = errors > 2.0
     assert np.mean(wild) == pytest.approx(0.05, abs=5.0 * math.sqrt(0.05 / wild.size))
@@ -475,16 +474,16 @@ def test_deadlines_and_latencies_of_a_run_by_hand() -> None:
     recording.rows = [(0.0,)] * 6  # Five periods.
     for period, latency in ((0, 0.004), (1, 0.006), (2, 0.021), (4, 0.005), (4, 0.012)):
         recording.commands.append((period, latency, 0.001, 0.003, 0.0005, DRIVING, 0))
-    told = timing(setup, recording)
-    assert told["periods"] == 5
-    assert told["answered_in_time"] == 3  # 2 came too late, 3 not at all, 4 twice.
-    assert told["deadline_misses"] == 2
-    assert told["rate"] == pytest.approx(30.0)
-    assert told["wake_to_action"]["median"] == pytest.approx(0.0055)
-    assert told["wake_to_action"]["max"] == pytest.approx(0.021)
-    assert told["stages"]["estimate_to_command"]["median"] == pytest.approx(0.002)
-    assert told["solve_time"]["p99"] == pytest.approx(0.0005)
-    assert told["estimate_age"]["max"] == 0.03
+    found = timing(setup, recording)
+    assert found["periods"] == 5
+    assert found["answered_in_time"] == 3  # 2 came too late, 3 not at all, 4 twice.
+    assert found["deadline_misses"] == 2
+    assert found["rate"] == pytest.approx(30.0)
+    assert found["wake_to_action"]["median"] == pytest.approx(0.0055)
+    assert found["wake_to_action"]["max"] == pytest.approx(0.021)
+    assert found["stages"]["estimate_to_command"]["median"] == pytest.approx(0.002)
+    assert found["solve_time"]["p99"] == pytest.approx(0.0005)
+    assert found["estimate_age"]["max"] == 0.03
 
 
 @pytest.mark.parametrize(

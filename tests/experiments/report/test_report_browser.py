@@ -1,4 +1,4 @@
-"""The report in a real browser: what it looks like, and what it does."""
+"""The report in a real browser: layout, policy, sorting, colours, replay, print."""
 
 import json
 
@@ -24,11 +24,11 @@ for (const element of document.body.querySelectorAll("*")) {
 }
 return outside;
 """
-"""What is wider than the screen though it does not scroll within its own box."""
+"""Script that lists elements wider than the screen outside of scrolling boxes."""
 
 
 def overflow(browser):
-    """By how many px all of an opened page is wider than the screen, and what sticks out."""
+    """Return by how many px a page, all folds open, exceeds the screen, and which elements do."""
     browser.execute_script("document.querySelectorAll('details').forEach((one) => one.open = true)")
     measure = "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
     return browser.execute_script(measure), browser.execute_script(HIDDEN_OVERFLOW)
@@ -105,7 +105,7 @@ def test_its_policy_stops_what_is_not_its_own(browser, page):
 
 
 def column(browser, table, name):
-    """Texts of a column, and its heading."""
+    """Return the texts of a column and its heading."""
     heads = browser.find_elements(By.CSS_SELECTOR, f"#{table} thead th")
     place = next(k for k, head in enumerate(heads) if head.text.startswith(name))
     cells = browser.find_elements(By.CSS_SELECTOR, f"#{table} tbody tr > :nth-child({place + 1})")
@@ -113,7 +113,7 @@ def column(browser, table, name):
 
 
 def table_of(browser, caption):
-    """Id of the table whose caption holds some words."""
+    """Return the id of the table whose caption contains the words."""
     found = browser.find_elements(By.CSS_SELECTOR, "figure.tabular")
     return next(one.get_attribute("id") for one in found if caption in one.text)
 
@@ -208,7 +208,7 @@ def test_the_replay_is_scrubbed_by_slider_keys_and_charts(browser, page, width):
 
 
 def test_the_replay_says_what_was_driven(browser, page):
-    """Values of the embedded, quantised drive against the trace that it was made of."""
+    """Values of the embedded, quantised drive equal those of its trace."""
     show(browser, page)
     Select(browser.find_element(By.ID, "replay-second")).select_by_visible_text("none")
     slider = browser.find_element(By.ID, "replay-time")

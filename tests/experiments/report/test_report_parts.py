@@ -1,4 +1,4 @@
-"""Charts, scales and the replay's data, against what they are made of."""
+"""Charts, scales and the replay's data, against the data that they show."""
 
 import base64
 import json
@@ -66,7 +66,7 @@ def test_ticks_are_worded_in_short():
 
 
 def distance(point, line):
-    """From a point (2,) to the nearest of a polyline (n, 2)."""
+    """Return the distance from a point (2,) to a polyline (n, 2)."""
     starts, chords = line[:-1], np.diff(line, axis=0)
     along = ((point - starts) * chords).sum(axis=1) / (chords**2).sum(axis=1)
     nearest = starts + np.clip(along, 0.0, 1.0)[:, None] * chords
@@ -87,7 +87,7 @@ def test_a_simplified_line_passes_by_every_point_it_left_out():
 
 
 def drawn(data):
-    """Points of path data as `charts.polyline` writes it."""
+    """Return the points of path data written by `charts.polyline`."""
     x, y, rest = re.fullmatch(r"M(-?\d+) (-?\d+)l(.*)", data).groups()
     steps = np.array([int(number) for number in re.findall(r"-?\d+", rest)]).reshape(-1, 2)
     return np.cumsum(np.vstack([[int(x), int(y)], steps]), axis=0)
@@ -206,10 +206,10 @@ def restored(packed, count):
 
 def test_embedded_quantities_are_the_traces_to_16_bits():
     made = drive()
-    told = json.loads(json.dumps(replay.moments(made)))
-    assert told["count"] == 300
-    assert told["duration"] == pytest.approx(made.trace["time"][-1])
-    values = {name: restored(packed, 300) for name, packed in told["values"].items()}
+    moments = json.loads(json.dumps(replay.moments(made)))
+    assert moments["count"] == 300
+    assert moments["duration"] == pytest.approx(made.trace["time"][-1])
+    values = {name: restored(packed, 300) for name, packed in moments["values"].items()}
     for name, wanted in (
         ("lateral", made.trace["lateral_error"]), ("heading", made.trace["heading_error"]),
         ("x", made.trace["state"][:, 4]), ("y", made.trace["state"][:, 5]),
@@ -221,9 +221,9 @@ def test_embedded_quantities_are_the_traces_to_16_bits():
 
 def test_long_drives_are_thinned_evenly_in_time():
     long = Drive("a", "T1", case(1), trace(n=4000))
-    told = replay.moments(long)
-    assert told["count"] == replay.SAMPLES
-    x = restored(told["values"]["x"], replay.SAMPLES)
+    moments = replay.moments(long)
+    assert moments["count"] == replay.SAMPLES
+    x = restored(moments["values"]["x"], replay.SAMPLES)
     np.testing.assert_allclose(np.diff(x), np.diff(x).mean(), atol=0.05)
 
 
