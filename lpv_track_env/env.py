@@ -14,14 +14,14 @@ from lpv_track_env import episodes, kernels, plants
 from lpv_track_env.conditions import Actuation, Conditions
 from lpv_track_env.conditions import episode as conditions_episode
 from lpv_track_env.conditions import load as load_conditions
-from lpv_track_env.conditions.layout import ConditionsArrays
+from lpv_track_env.conditions.layout import ConditionedVehicle
 from lpv_track_env.draws import random_key
+from lpv_track_env.episodes import single_info
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.plants import PlantEpisode
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.task import Task, action_space, checked_period, reference
-from lpv_track_env.validation import check_finite, given_start, two_numbers
-from lpv_track_env.vector_infos import single_info
+from lpv_track_env.validation import check_finite, given_start, names_unknown, two_numbers
 from lpv_track_env.vehicle import VehicleParameters
 from lpv_track_env.vehicle import load as load_vehicle
 from trajectories import ReferencePath
@@ -55,19 +55,20 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     The actuators clip range (the bounds above, of the vehicle) and rate (0.5236 rad/s, 5 m/s^3):
     `info["clipped"]` holds bits 1 (acceleration range), 2 (its rate), 4 (steering range), 8 (its
-    rate). An action that is not finite, or of the wrong shape or type, is a ValueError and leaves
-    the episode untouched.
+    rate). An action that is not finite, or of the wrong shape or type, raises a ValueError and
+    leaves the episode untouched.
 
     ## Observation space
 
     `Box(float32, (8 + 2 K,))`: body velocities, yaw rate, actuators, errors and a preview of the
-    reference's curvature and speed over K periods. Every entry, its unit and sign:
-    `lpv_track_env.observation`. Values beyond a bound saturate.
+    reference's curvature and speed over K periods. `lpv_track_env.observation` lists every entry
+    with its unit and sign. Values beyond a bound saturate.
 
     ## Reward
 
     Sum of the named terms in `info["reward_terms"]`: progress, lateral, heading, speed, input_rate,
-    end; formulas and default weights in `lpv_track_env.reward`. Perfect tracking gives 1 a second.
+    end; `lpv_track_env.reward` has formulas and default weights. Perfect tracking gives 1 per
+    second.
 
     ## Episode end
 
@@ -80,29 +81,30 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     | `wrong_heading` | heading error over 90 degrees |
     | `non_finite` | the state is no longer finite (the last finite one is kept) |
 
-    `truncated`, with `info["end"] = "time_limit"`, by the time limit alone.
+    `truncated`, with `info["end"] = "time_limit"`, at the time limit only.
 
     ## Starting state
 
-    On the path at its start, at the reference speed, steering straight. `initial_error_range` draws
-    uniform errors in lateral offset (m), heading (rad) and speed (m/s); `random_start` draws the
-    arc length too. `reset(seed=...)` seeds `self.np_random` and takes one key from it; the episodes
-    that follow draw from key and number of the episode, see `lpv_track_env.episodes`. So
-    environment i of a `PathTrackingVectorEnv` reset with seed s is this one reset with s + i.
+    On the path at its start, at the reference speed, steering straight. `initial_error_range` gives
+    uniformly drawn errors in lateral offset (m), heading (rad) and speed (m/s); `random_start`
+    draws the arc length, too. `reset(seed=...)` seeds `self.np_random` and takes one key from it;
+    an episode depends on this key and the episode's number (`lpv_track_env.episodes`). Environment
+    i of a `PathTrackingVectorEnv` reset with seed s therefore equals this one reset with s + i.
 
     `reset(options=...)` takes `trajectory`, `vehicle` (both as in the arguments), `arc_length` (m),
-    `lateral_error` (m), `heading_error` (rad), `speed_error` (m/s); these hold for the episode
-    that begins, and the next reset returns to the constructor's.
+    `lateral_error` (m), `heading_error` (rad), `speed_error` (m/s). They hold for one episode; the
+    next reset returns to the constructor's arguments.
 
     ## Info
 
-    `lateral_error, heading_error, speed_error, arc_length, state` (truth, (6,): vx, vy, psi, r, X,
-    Y), `reward_terms, clipped`, and at the end `end`.
+    `lateral_error, heading_error, speed_error, arc_length, state` (true state, (6,): vx, vy, psi,
+    r, X, Y), `reward_terms, clipped`, and at the end `end`.
 
-    Under other conditions than "simulation" the observation is made of an estimate, with everything
-    else of the truth as ever, and there are also `estimate` (6,), `position_deviation` (m, of the
-    filter, in the worst direction; 0 without one), `stopping` (the vehicle brakes by itself:
-    no fixes or no commands for too long) and `deadline_misses` (so far in the episode).
+    Under conditions other than "simulation" the observation is made from an estimate; rewards and
+    the entries above are still those of the true state. Further entries: `estimate` (6,),
+    `position_deviation` (m, of the filter in the worst direction; 0 without a filter), `stopping`
+    (the vehicle brakes to a stop, since fixes or commands are overdue) and `deadline_misses` (so
+    far in the episode).
 
     ## Arguments
 
@@ -116,8 +118,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     conditions
         "simulation" (perfect actuators, sensors, knowledge of the vehicle), "realtime" (our model
         of a vehicle's runs), a `lpv_track_env.conditions.Conditions`, or a dictionary of its
-        fields, e.g. `{"name": "realtime", "estimator": "raw"}`. What is a range there is drawn for
-        every episode.
+        fields, e.g. `{"name": "realtime", "estimator": "raw"}`. Ranges are drawn anew for every
+        episode.
     control_period
         s; the dynamics are integrated with fixed Runge-Kutta steps of at most 5 ms within it.
     preview_steps, preview_period
@@ -129,24 +131,25 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     time_limit
         s; by default one and a half times the path's duration plus 10 s.
     plant
-        What moves under the commands: "bicycle", or a vehicle that this project did not model
-        (`lpv_track_env.plants`): "single-track", "drift", "multi-body", for the vehicles
-        `ford-escort`, `bmw-320i`, `vw-vanagon`; or a function of `VehicleParameters` that makes a
-        `Plant`. A step with these costs 20 to 200 times as much, more below 2 m/s.
+        Model of the driven vehicle: "bicycle", or a model by others (`lpv_track_env.plants`):
+        "single-track", "drift", "multi-body", for the vehicles `ford-escort`, `bmw-320i`,
+        `vw-vanagon`; or a function of `VehicleParameters` that returns a `Plant`. A step with these
+        takes 20 to 200 times as long, more below 2 m/s.
     render_colour
-        What frames colour the path by: "speed", the reference's, or "curvature".
+        Colour of the path in frames: by "speed", the reference's, or by "curvature".
 
     ## Version history
 
     v0: first version.
     """
 
-    # `render_fps` is one frame a control period: an instance has its own.
+    # An instance has its own `render_fps`: one frame per control period.
     metadata: dict[str, Any] = {  # noqa: RUF012  declared so by gymnasium.Env
         "render_modes": ["human", "rgb_array"],
         "render_fps": 20,
     }
 
+    @names_unknown
     def __init__(
         self,
         trajectory: str | Path | ReferencePath = "T1",
@@ -198,19 +201,19 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._running = False
         self._draws = np.zeros(2, dtype=np.uint64)
         self._key, self._episode = np.uint64(0), -1
-        self._conditioned: ConditionsArrays | None = None
+        self._conditioned: ConditionedVehicle | None = None
         self._renderer: Renderer | None = None
         self._open_views()
         self._use(self.base_task, self._plant_of(self.base_task))
 
     def _open_views(self) -> None:
-        """Parts of the episode's array: to make a view costs as much as a copy."""
+        """Make views of the episode's array once, since making one takes as long as a copy."""
         data = self._episode_data
         self._record = data[kernels.RECORD : kernels.CONSTANTS]
         self._state = self._record[:6]
         self._constants = data[kernels.CONSTANTS : kernels.OBSERVATION]
         self._observation = data[kernels.OBSERVATION :].view(np.float32)
-        # Python numbers pass through a memoryview in half the time.
+        # Writing Python numbers through a memoryview takes half the time.
         self._command: Any = data.data
 
     def _use(self, task: Task, plant: PlantEpisode | None) -> None:
@@ -218,7 +221,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             return
         self.task, self._plant = task, plant
         self._constants[:] = task.constants()
-        self._conditioned = ConditionsArrays.of(task)
+        self._conditioned = ConditionedVehicle.of(task)
         self._take_table(task.path.table)
 
     def _plant_of(self, task: Task) -> PlantEpisode | None:
@@ -235,7 +238,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._advance: Callable[..., Any] = self._first_advance
 
     def _first_advance(self, *arguments: NDArray[Any]) -> Any:
-        """Have the kernel compiled where it is needed, in a first step, and go there."""
+        """Find the kernel of the first step, compile it if need be, and call it."""
         if self._plant is not None:
             self._advance = self._plant.advance
         elif self._conditioned is not None:
@@ -266,35 +269,35 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     @property
     def actuation(self) -> Actuation:
-        """Delays and lags between a command and its effect, as known beforehand (s)."""
+        """Nominal delays and lags between a command and its effect (s)."""
         return Actuation() if self.conditions is None else self.conditions.actuation
 
     @property
     def actuators(self) -> tuple[float, float]:
-        """Acceleration (m/s^2) and steering angle (rad) that the actuators have in force."""
+        """Acceleration (m/s^2) and steering angle (rad) in force at the actuators."""
         return float(self._record[kernels.ACCELERATION]), float(self._record[kernels.STEERING])
 
     @property
     def controller_busy(self) -> bool:
-        """Whether the controller still computes an earlier action: the next will be dropped."""
+        """True while the controller computes an earlier action: the next one will be dropped."""
         now = float(self._record[kernels.STEPS] * self.control_period)
         return self._conditioned is not None and self._conditioned.busy_at(now)
 
     def set_computing_time(self, latency: float, occupied: float | None = None) -> None:
-        """Say how long the next step's action took to compute, in place of `computing_delay`.
+        """Set the computing time of the next step's action, in place of `computing_delay`.
 
         Parameters
         ----------
         latency
-            From the readings to the command, s.
+            Time from the readings to the command, s.
         occupied
-            How long the controller can take up nothing new, s; by default as long as that. A
-            pipeline of processes is busy for less than what passes through it takes.
+            Time for which the controller is busy, s; by default `latency`. A pipeline of processes
+            is busy for less time than its latency.
 
         Raises
         ------
         ValueError
-            Under conditions "simulation", where commands land at once, or for a negative time.
+            Under conditions "simulation", which have no delays, or for a negative time.
         """
         if self._conditioned is None:
             raise ValueError("conditions 'simulation' have no delays: make the env with others")
@@ -347,7 +350,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._observation.copy(), info
 
     def _count_episode(self, *, reseeded: bool) -> None:
-        """Take a new key from `np_random` if it was seeded, else go on to the next episode."""
+        """Take a new key from `np_random` if it was seeded, else count the next episode."""
         if reseeded or self._episode < 0:
             self._key = random_key(self.np_random)
             self._episode = 0
@@ -355,7 +358,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._episode += 1
 
     def episode_task(self, options: Mapping[str, Any]) -> Task:
-        """Task of an episode with reset options `trajectory` and `vehicle`, if given."""
+        """Return the task of an episode with reset options `trajectory` and `vehicle`, if given."""
         if not {"trajectory", "vehicle"} & set(options):
             return self.base_task
         car = load_vehicle(options.get("vehicle", self.base_task.vehicle))
@@ -372,8 +375,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise gymnasium.error.ResetNeeded(
                 "the episode has not begun or has ended: call reset() before step()"
             )
-        # What a step costs beside its kernel is spent here: few operations for the usual action, a
-        # closer look at all else. An action that is refused leaves the episode untouched.
+        # Most of a step's time outside the kernel is spent here: few operations for the usual kind
+        # of action, checks for any other. A refused action leaves the episode untouched.
         values = action.tolist() if type(action) is np.ndarray else action
         if type(values) is list and len(values) == 2:
             a, delta = values
@@ -384,7 +387,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         command = self._command
         command[0] = a
         command[1] = delta
-        # To copy a dictionary and to fill it takes less time than to write a new one.
+        # Copying and filling a dictionary is faster than writing a new one.
         info = INFO.copy()
         info["reward_terms"] = terms = REWARD_TERMS.copy()
         (
@@ -425,7 +428,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._open_renderer(self.render_mode).draw(self._record)
 
     def _begin_drawing(self) -> None:
-        """Tell the renderer, if there is one, of a new episode."""
+        """Announce a new episode to the renderer, if there is one."""
         if self._renderer is not None:
             self._renderer.begin(self.task)
 
@@ -440,7 +443,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def draw(
         self, task: Task, record: NDArray[np.float64], notes: Mapping[str, str] | None = None
     ) -> NDArray[np.uint8]:
-        """Draw an episode and `notes` that are not this environment's own: (600, 900, 3) uint8."""
+        """Draw an episode of another environment and `notes`: a frame (600, 900, 3) uint8."""
         renderer = self._open_renderer("rgb_array")
         renderer.begin(task)
         renderer.notes = notes or {}
@@ -451,9 +454,9 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def show_agent(
         self, plan: NDArray[np.float64] | None = None, notes: Mapping[str, str] | None = None
     ) -> None:
-        """Draw what an agent shows from now on, in place of what it showed.
+        """Draw an agent's plan and notes from now on, in place of earlier ones.
 
-        `plan`: predicted positions, (n, 2) m in the world; `notes`: words by label, a row each.
+        `plan`: predicted positions, (n, 2) m in the world; `notes`: one row of text for each label.
         """
         if self.render_mode is not None:
             renderer = self._open_renderer(self.render_mode)
@@ -466,7 +469,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer = None
 
     def __getstate__(self) -> dict[str, Any]:
-        # Copied on their own, the views would no longer look at the array.
+        # Copies of the views would not refer to the copied array.
         views = {"_record", "_state", "_constants", "_observation", "_command"}
         compiled = {"_arguments", "_advance"}
         kept = {

@@ -1,27 +1,30 @@
-"""How episodes begin: what is drawn for them (`draws`) and the record it leads to.
+"""Beginnings of episodes, with the random draws for them, and infos made from their records.
 
 An environment holds one random 64-bit key and counts its episodes. An episode does not depend on
-how many environments there are, on which of them reset before, or on what else was drawn.
+the number of environments, on which of them were reset before, or on other draws.
 """
 
 import math
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels
 from lpv_track_env.bicycle import PSI, VX, X, Y
 from lpv_track_env.draws import uniform
+from lpv_track_env.reward import TERMS
 from trajectories.compilation import compiled, compiled_internal
 from trajectories.table import heading_at, position_at, speed_at
 
 Array = NDArray[Any]
+Infos = dict[str, Any]
 
 TRAJECTORY_DRAW, VEHICLE_DRAW, START_DRAW, LATERAL_DRAW, HEADING_DRAW, SPEED_DRAW = range(6)
 """Number of each draw within an episode."""
 
 GIVEN = ("arc_length", "lateral_error", "heading_error", "speed_error")
-"""What `begin` takes instead of drawing it, in this order; NaN is drawn."""
+"""Starting values that reset options may give, in the order of `given` in `begin`."""
 
 ROLLING_DECELERATION = 6
 """Index of mu g in the constants."""
@@ -29,7 +32,7 @@ ROLLING_DECELERATION = 6
 
 @compiled_internal
 def error(given: Any, half: Any, key: Any, episode: Any, draw: int) -> Any:
-    """Initial error: as given, or uniform within +-half."""
+    """Return an initial error: the given one, or drawn uniformly within +-half if that is NaN."""
     if not math.isnan(given):
         return given
     return half * (2.0 * uniform(key, episode, draw) - 1.0)
@@ -40,9 +43,9 @@ def begin(
     record: Array, constants: Array, table: Array, observation: Array,
     key: Any, episode: Any, given: Array,
 ) -> None:  # fmt: skip
-    """Begin an episode: draw what is not given, set the state, write record and observation.
+    """Begin an episode: draw its start, set the state, write record and observation.
 
-    `given`, shape (4,), as `GIVEN` lists it: m, m, rad, m/s.
+    `given`, (4,) as `GIVEN` lists them in m, m, rad, m/s, replaces what would be drawn; NaN: drawn.
     """
     p = constants
     s = given[0]
@@ -62,3 +65,67 @@ def begin(
     record[kernels.ACCELERATION] = p[ROLLING_DECELERATION]
     record[kernels.ARC_LENGTH] = s
     kernels.start(record, p, table, observation)
+
+
+END_NAMES = np.array(kernels.END_NAMES, dtype=object)
+
+
+def episode_infos(records: Array, mask: Array | None = None) -> Infos:
+    """Return infos of the episodes that `mask` (n,) marks, or of all; zeros for the others.
+
+    They are in the form in which Gymnasium's `SyncVectorEnv` gathers infos. `records` are
+    (n, RECORD_SIZE).
+    """
+    # One copy with a contiguous row for every entry.
+    if mask is None:
+        mask = np.ones(len(records), dtype=np.bool_)
+        values = records.T.copy()
+    else:
+        values = np.zeros(records.T.shape)
+        values[:, mask] = records[mask].T
+    terms: Infos = {}
+    for k, name in enumerate(TERMS):
+        terms[name], terms[f"_{name}"] = values[kernels.TERMS + k], mask
+    infos: Infos = {
+        "lateral_error": values[kernels.LATERAL_ERROR],
+        "heading_error": values[kernels.HEADING_ERROR],
+        "speed_error": values[kernels.SPEED_ERROR],
+        "arc_length": values[kernels.ARC_LENGTH],
+        "state": np.ascontiguousarray(values[:6].T),
+        "reward_terms": terms,
+        "clipped": values[kernels.CLIPPED].astype(np.int64),
+    }
+    infos.update({f"_{name}": mask for name in list(infos)})
+    ends = values[kernels.END]
+    ended = ends != kernels.RUNNING
+    if ended.any():
+        infos["end"] = np.where(ended, END_NAMES[ends.astype(np.int64)], None)
+        infos["_end"] = ended
+    return infos
+
+
+def final_infos(records: Array, observations: Array, ended: Array) -> Infos:
+    """Return `final_obs` and `final_info` of the episodes that have `ended` (n,), with masks."""
+    final = np.full(len(ended), None, dtype=object)
+    for i in np.flatnonzero(ended).tolist():
+        final[i] = observations[i].copy()
+    return {
+        "final_obs": final,
+        "_final_obs": ended,
+        "final_info": episode_infos(records, ended),
+        "_final_info": ended,
+    }
+
+
+def single_info(record: Array) -> Infos:
+    """Return the info of one episode, without its end, as `PathTrackingEnv` gives it."""
+    values = record.tolist()
+    return {
+        "lateral_error": values[kernels.LATERAL_ERROR],
+        "heading_error": values[kernels.HEADING_ERROR],
+        "speed_error": values[kernels.SPEED_ERROR],
+        "arc_length": values[kernels.ARC_LENGTH],
+        "state": record[:6].copy(),
+        "reward_terms": dict(zip(TERMS, values[kernels.TERMS :], strict=True)),
+        "clipped": int(values[kernels.CLIPPED]),
+    }

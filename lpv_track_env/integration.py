@@ -1,8 +1,7 @@
-"""Integration of the bicycle by classic Runge-Kutta steps: one step, shared by every environment.
+"""Integration of the bicycle by classic Runge-Kutta steps.
 
-The single environment takes the steps of one vehicle one after another; the vector environment
-takes one step of many vehicles side by side. Both call `runge_kutta`, and IEEE arithmetic gives
-both the same bits.
+The single environment takes all steps of one vehicle; the vector environment takes one step of
+many vehicles at a time. Both call `runge_kutta`, so that IEEE arithmetic gives the same bits.
 """
 
 import math
@@ -18,7 +17,7 @@ from trajectories.compilation import compiled_inline, compiled_internal
 
 @compiled_inline
 def turned(angle: Any) -> tuple[Any, Any]:
-    """(cos, sin) of a small angle: Taylor series to order 7, no call of libm."""
+    """Return (cos, sin) of a small angle by Taylor series of order 7, without calling libm."""
     q = angle * angle
     return (
         1.0 - q * (0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0))),
@@ -28,14 +27,14 @@ def turned(angle: Any) -> tuple[Any, Any]:
 
 @compiled_inline
 def rotate(c: Any, s: Any, angle: Any) -> tuple[Any, Any]:
-    """(cos, sin) of a heading turned by a small angle."""
+    """Return (cos, sin) of a heading turned by a small angle."""
     dc, ds = turned(angle)
     return c * dc - s * ds, s * dc + c * ds
 
 
 @compiled_internal
 def inverse_speed(vx: Any, lanes: bool) -> Any:
-    """q(vx), see `bicycle`: by a branch, or without one; `lanes` is a constant where it is used."""
+    """Return q(vx), see `bicycle`; without a branch if `lanes`, a constant at compile time."""
     return compiled_inverse_speed_of_lanes(vx) if lanes else compiled_inverse_speed(vx)
 
 
@@ -44,15 +43,15 @@ def runge_kutta(
     vx: Any, vy: Any, r: Any, c: Any, s: Any, a: Any, delta: Any, cd: Any, sd: Any,
     p1: Any, p2: Any, p3: Any, p4: Any, p5: Any, p6: Any, h: Any, lanes: bool,
 ) -> tuple[Any, Any, Any, Any, Any, Any]:  # fmt: skip
-    """One Runge-Kutta step (classic, order 4) of h seconds, inputs held.
+    """Take one Runge-Kutta step (classic, order 4) of h seconds, inputs held.
 
     (c, s) and (cd, sd) are cosine and sine of heading and steering angle. The yaw rate r, the
     acceleration a and the parameters p1 to p6 (from the yaw inertia on) are in units of half a
     step, see `in_half_steps`. Returns the new vx, vy and r, and the changes of psi (rad), X and Y
     (m).
 
-    What the next stage waits for is few operations long: half a step's change is the derivative
-    itself, and positions, which nothing waits for, are summed in the frame of the step's start.
+    The chain of operations from stage to stage is short: in these units the change over half a
+    step is the derivative itself, and positions are summed in the frame of the step's start.
     """
     q = inverse_speed(vx, lanes)
     k1 = compiled_field(vx, vy, r, 1.0, 0.0, a, delta, cd, sd, q, 1.0, p1, p2, p3, p4, p5, p6)
@@ -72,7 +71,7 @@ def runge_kutta(
     ahead = sixth * (k1[4] + 2.0 * (k2[4] + k3[4]) + k4[4])
     aside = sixth * (k1[5] + 2.0 * (k2[5] + k3[5]) + k4[5])
     return (
-        # The last stage, which comes latest, is added at the very end.
+        # The last stage is added at the very end, since it is ready last.
         (vx + third * (k1[0] + 2.0 * (k2[0] + k3[0]))) + third * k4[0],
         (vy + third * (k1[1] + 2.0 * (k2[1] + k3[1]))) + third * k4[1],
         (r + third * (k1[3] + 2.0 * (k2[3] + k3[3]))) + third * k4[3],
@@ -86,11 +85,11 @@ def runge_kutta(
 def in_half_steps(
     half: Any, p0: Any, p1: Any, p2: Any, p3: Any, p4: Any, p5: Any, p6: Any
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """Parameters p1 to p6 per unit of mass p0, with `half` a step (s) as the unit of time.
+    """Return parameters p1 to p6 per unit of mass p0, with `half` a step (s) as the unit of time.
 
-    Speeds stay what they are if the unit of length is what 1 m/s covers in that time; so does the
-    field, for the equations hold in any units. Yaw rates and accelerations are `half` times those
-    in SI units, lengths 1 / half times, and the yaw inertia per mass, a length squared, likewise.
+    The unit of length is the distance that 1 m/s covers in that time, so that speeds keep their
+    numbers. Yaw rates and accelerations are `half` times those in SI units, lengths 1 / half times,
+    and the yaw inertia per mass, a length squared, 1 / half^2 times.
     """
     inverse = 1.0 / half
     stiffness = half / p0
@@ -105,9 +104,9 @@ def integrate(
     vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, a: Any, delta: Any,
     p0: Any, p1: Any, p2: Any, p3: Any, p4: Any, p5: Any, p6: Any, h: Any, substeps: int,
 ) -> tuple[Any, Any, Any, Any, Any, Any]:  # fmt: skip
-    """State after `substeps` Runge-Kutta steps of h seconds, inputs held.
+    """Return the state after `substeps` Runge-Kutta steps of h seconds, inputs held.
 
-    Sines and cosines are taken once: the heading's pair is then turned by each step's small angle.
+    Sine and cosine of the heading are computed once, then turned by each step's small angle.
     """
     cd, sd = math.cos(delta), math.sin(delta)
     c, s = math.cos(psi), math.sin(psi)

@@ -1,8 +1,7 @@
 """Compiled kernels of path tracking: actuators, integration, projection, reward, observation.
 
-The scalar functions `actuate`, `integrate`, `observe` and `judge` are what every environment
-shares; `drive` and `start` work on one episode's arrays, `advance` on all of a single environment
-packed into one array. The indices below name the arrays' entries.
+`drive` and `start` work on one episode's arrays, `advance` on all arrays of a single environment in
+one. Every environment shares the functions below them. The constants name the arrays' entries.
 """
 
 import math
@@ -22,9 +21,9 @@ from trajectories.table import cell, fill_preview, saturate, speed_in
 
 Array = NDArray[Any]
 
-# Record of an episode, (RECORD_SIZE,) float64: the state, then
+# Record of an episode, (RECORD_SIZE,) float64: the state [vx, vy, psi, r, X, Y], then
 ACCELERATION, STEERING, START, STEPS, REFERENCE_SPEED, END = 6, 7, 8, 9, 10, 11
-# and, from ARC_LENGTH on, what a step is reported by:
+# and, from ARC_LENGTH on, the quantities that a step reports:
 ARC_LENGTH, LATERAL_ERROR, HEADING_ERROR, SPEED_ERROR, CLIPPED, REWARD, TERMS = (
     12, 13, 14, 15, 16, 17, 18,
 )  # fmt: skip
@@ -44,19 +43,19 @@ CONSTANTS_SIZE = 35
 RECORD = 2
 CONSTANTS = RECORD + RECORD_SIZE
 OBSERVATION = CONSTANTS + CONSTANTS_SIZE
-"""From here on float32, two numbers to an entry."""
+"""First entry of the observation: float32, two numbers in each float64."""
 
 RUNNING, FINISHED, LEFT_CORRIDOR, WRONG_HEADING, NON_FINITE, TIME_LIMIT, COLLISION = range(7)
 END_NAMES = (
     "running", "finished", "left_corridor", "wrong_heading", "non_finite", "time_limit",
     "collision",
 )  # fmt: skip
-"""How an episode ends, by code; the last only where there is other traffic."""
+"""Ends of an episode by code; a collision only in traffic."""
 NOT_FINITE = -1
-"""In place of such a code: the command is not finite."""
+"""Code in place of an end: the command is not finite."""
 
 RANGE_ACCELERATION, RATE_ACCELERATION, RANGE_STEERING, RATE_STEERING = 1, 2, 4, 8
-"""Bits of what the actuators clipped."""
+"""Bits that tell which limits of the actuators clipped the command."""
 
 MAX_HEADING_ERROR = 0.5 * math.pi
 BOUNDS = tuple(bound for _, _, bound in SCALARS)
@@ -65,13 +64,13 @@ CURVATURE_BOUND, SPEED_BOUND = (bound for _, _, bound in PREVIEW_BOUNDS)
 
 @compiled_internal
 def clip(value: Any, low: Any, high: Any) -> Any:
-    """`value` within [low, high]."""
+    """Return `value` clipped to [low, high]."""
     return min(max(value, low), high)
 
 
 @compiled_internal
 def wrap(angle: Any) -> Any:
-    """Angle in (-pi, pi]; exact (untouched) where it already lies there."""
+    """Return an angle wrapped to (-pi, pi]; an angle in that range is returned unchanged."""
     if -math.pi < angle <= math.pi:
         return angle
     wrapped = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
@@ -90,12 +89,12 @@ def actuate(
     high_a: Any,
     a_step: Any,
 ) -> tuple[Any, Any, Any]:
-    """Commands after the actuators' range and rate limits, and the bits of what was clipped."""
+    """Return the commands after the actuators' range and rate limits, and the clipping bits."""
     ranged_a, ranged_delta = clip(a, low_a, high_a), clip(delta, -max_delta, max_delta)
     rated_a = clip(ranged_a, last_a - a_step, last_a + a_step)
     rated_delta = clip(ranged_delta, last_delta - delta_step, last_delta + delta_step)
-    # A controller that drives along a bound must not be reported for its rounding. In sums, for the
-    # branches would be taken at random.
+    # The tolerance ignores the rounding of a controller that drives along a bound. Sums rather than
+    # branches, since these would be hard to predict.
     bits = (
         RANGE_ACCELERATION * (abs(ranged_a - a) > 1e-6)
         + RATE_ACCELERATION * (abs(rated_a - ranged_a) > 1e-6)
@@ -109,7 +108,7 @@ def actuate(
 def observe(
     record: Array, constants: Array, table: Array, observation: Array, index: int, u: Any
 ) -> None:  # fmt: skip
-    """Write the observation (see `observation`); the foot point is at u in [0, 1] of a cell."""
+    """Write the observation (see `observation`) at a foot point, at u in [0, 1] of a cell."""
     o, k = observation, (observation.shape[0] - PREVIEW_START) // 2
     o[entry.LONGITUDINAL_SPEED] = saturate(record[VX], BOUNDS[entry.LONGITUDINAL_SPEED])
     o[entry.LATERAL_SPEED] = saturate(record[VY], BOUNDS[entry.LATERAL_SPEED])
@@ -130,7 +129,7 @@ def observe(
 def locate(
     record: Array, constants: Array, table: Array, near: Any, ahead: Any, window: Any
 ) -> tuple[int, Any]:
-    """Project the vehicle on the path, about `ahead` m after `near`, and note its errors.
+    """Project the vehicle on the path, about `ahead` m after `near`, and record its errors.
 
     Returns the foot point's cell and u in it.
     """
@@ -148,17 +147,17 @@ def locate(
 
 
 @compiled
-def look(
+def locate_and_observe(
     record: Array, constants: Array, table: Array, observation: Array, ahead: Any, window: Any
 ) -> None:
-    """Find the record's state on the path, about `ahead` m from its arc length, and observe it."""
+    """Project the record's state on the path, about `ahead` m from its arc length, and observe."""
     index, u = locate(record, constants, table, record[ARC_LENGTH], ahead, window)
     observe(record, constants, table, observation, index, u)
 
 
 @compiled_inline
-def judge(record: Array, constants: Array, finite: bool) -> int:
-    """How the episode stands: RUNNING or the code of its end."""
+def end_code(record: Array, constants: Array, finite: bool) -> int:
+    """Return RUNNING or the code of the episode's end."""
     if not finite:
         return NON_FINITE
     if abs(record[LATERAL_ERROR]) > constants[CORRIDOR]:
@@ -200,9 +199,9 @@ def finish(
         n = table.shape[0]
         index, offset = cell(before, p[LENGTH], p[CLOSED] > 0.5, n)
         u = offset * (n - 1) / p[LENGTH]
-    end = judge(record, constants, finite)
+    end = end_code(record, constants, finite)
     failed = end in (LEFT_CORRIDOR, WRONG_HEADING, NON_FINITE)
-    # A tuple, for a slice would be an array with a reference count to keep.
+    # A tuple, since a slice would be an array with a reference count.
     w = WEIGHTS
     weights = (
         p[w], p[w + 1], p[w + 2], p[w + 3], p[w + 4], p[w + 5], p[w + 6], p[w + 7], p[w + 8],
@@ -227,7 +226,7 @@ def finish(
 def drive(
     record: Array, a: Any, delta: Any, constants: Array, table: Array, observation: Array
 ) -> int:
-    """One control period of an episode under a command, in place; returns the code of its end."""
+    """Drive one control period of an episode, in place; return the code of its end."""
     p = constants
     a, delta, bits = actuate(
         a, delta, record[ACCELERATION], record[STEERING],
@@ -246,11 +245,11 @@ def drive(
 def advance(
     episode: Array, table: Array
 ) -> tuple[int, Any, Any, Any, Any, int, Any, Any, Any, Any, Any, Any, Any]:
-    """One control period of a single environment, packed into `episode`, in place.
+    """Drive one control period of a single environment, whose arrays `episode` holds, in place.
 
-    Returns the code of its end and the record from ARC_LENGTH on; NOT_FINITE, and nothing is
-    changed, for a command that is not finite. A step of Python pays for each array that it hands
-    over, and more for each number that it looks up: hence all in one, and all at once.
+    Returns the code of its end and the record from ARC_LENGTH on; for a command that is not finite
+    NOT_FINITE, and nothing changes. Passing one array and returning every number at once is the
+    fastest way from and to Python.
     """
     a, delta = episode[0], episode[1]
     m = episode[RECORD:CONSTANTS]
@@ -270,7 +269,7 @@ def advance(
 
 @compiled
 def command(episode: Array) -> tuple[Any, Any, int]:
-    """Actuators' values for the command in `episode`, and the bits of what they clipped."""
+    """Return the actuators' values for the command in `episode`, and the clipping bits."""
     m, p = episode[RECORD:CONSTANTS], episode[CONSTANTS:OBSERVATION]
     a, delta, bits = actuate(
         episode[0], episode[1], m[ACCELERATION], m[STEERING],
@@ -285,7 +284,7 @@ def conclude(
     episode: Array, table: Array,
     vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, a: Any, delta: Any, bits: int,
 ) -> int:  # fmt: skip
-    """End a control period whose new state another plant has come to; returns the end's code."""
+    """End a control period with the new state of another plant; return the end's code."""
     end: int = finish(
         episode[RECORD:CONSTANTS], episode[CONSTANTS:OBSERVATION], table,
         episode[OBSERVATION:].view(np.float32), vx, vy, psi, r, x, y, a, delta, bits,
@@ -295,7 +294,7 @@ def conclude(
 
 @compiled
 def start(record: Array, constants: Array, table: Array, observation: Array) -> None:
-    """Begin an episode from the state and actuators that `record` holds, near its ARC_LENGTH."""
+    """Begin an episode from the state and actuators in `record`, near its ARC_LENGTH."""
     near = record[ARC_LENGTH]
     record[START:] = 0.0
     window = min(SEARCH_WINDOW, constants[LENGTH])
@@ -306,7 +305,7 @@ def start(record: Array, constants: Array, table: Array, observation: Array) -> 
 
 @compiled
 def first_not_finite(commands: Array, ends: Array, skips_ended: bool) -> int:
-    """Index into the flat `commands` (n, 2) of the first that is not finite, or -1.
+    """Return the index into the flat `commands` (n, 2) of the first that is not finite, or -1.
 
     `skips_ended` leaves out environments whose episode has ended, by their codes `ends` (n,).
     """

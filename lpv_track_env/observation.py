@@ -1,6 +1,6 @@
-"""The observation contract: what every agent, model-based or learned, is given.
+"""The observation contract, the same for every agent, model-based or learned.
 
-A flat float32 vector. Everything is in the vehicle's or the path's own frame, so nothing wraps:
+A flat float32 vector in the frames of the vehicle and of the path, so that nothing wraps:
 
 ====================  =======  ==========================================================
 entry                 unit     meaning
@@ -8,8 +8,8 @@ entry                 unit     meaning
 longitudinal_speed    m/s      vx, body frame
 lateral_speed         m/s      vy, body frame, left positive
 yaw_rate              rad/s    r, counter-clockwise
-acceleration          m/s^2    the acceleration command that the actuator has in force
-steering_angle        rad      the steering angle that the actuator has in force, left positive
+acceleration          m/s^2    acceleration command in force at the actuator
+steering_angle        rad      steering angle in force at the actuator, left positive
 lateral_error         m        offset from the path's foot point, positive left of the path
 heading_error         rad      psi minus the path's heading at the foot point, in (-pi, pi]
 reference_speed       m/s      the reference's speed at the foot point
@@ -17,10 +17,10 @@ preview_curvature     1/m      (K,) mean signed curvature over each of the next 
 preview_speed         m/s      (K,) reference speed at the end of each of these periods
 ====================  =======  ==========================================================
 
-The preview runs on the reference's own time: node k lies where the reference is k preview periods
-after the foot point. Its interval k is about (speed at k + speed at k + 1) / 2 times the period
-long and turns the heading by exactly that length times `preview_curvature[k]`; so an agent
-rebuilds the reference in the frame of the foot point from the vector alone.
+The preview is spaced in the reference's own time: node k is the reference's position k preview
+periods after the foot point. Interval k is about (speed at k + speed at k + 1) / 2 times the period
+long and turns the heading by exactly that length times `preview_curvature[k]`. An agent can
+therefore rebuild the reference in the frame of the foot point from the vector alone.
 """
 
 import hashlib
@@ -55,13 +55,13 @@ MIRRORED = (
     "lateral_speed", "yaw_rate", "steering_angle", "lateral_error", "heading_error",
     "preview_curvature",
 )  # fmt: skip
-"""Entries that change sign where left and right are exchanged."""
+"""Entries that change sign when left and right are exchanged."""
 
 Array = NDArray[np.float64]
 
 
 class TrackingObservation(NamedTuple):
-    """A flat observation taken apart: scalars shaped (...), previews (..., K), float64."""
+    """Parts of a flat observation, float64: scalars (...), previews (..., K)."""
 
     longitudinal_speed: Array
     lateral_speed: Array
@@ -108,7 +108,7 @@ class ObservationLayout:
 
     @property
     def slices(self) -> dict[str, slice]:
-        """Where each named entry stands in the vector."""
+        """Place of each named entry in the vector."""
         scalars = {name: slice(k, k + 1) for k, (name, _, _) in enumerate(SCALARS)}
         first, k = PREVIEW_START, self.preview_steps
         return {
@@ -126,7 +126,7 @@ class ObservationLayout:
 
     @property
     def mirror(self) -> NDArray[np.float32]:
-        """Factor of each entry where left and right are exchanged: 1 or -1, shape (size,)."""
+        """Factor of each entry when left and right are exchanged: 1 or -1, shape (size,)."""
         signs = np.ones(self.size, dtype=np.float32)
         for name in MIRRORED:
             signs[self.slices[name]] = -1.0
@@ -134,22 +134,22 @@ class ObservationLayout:
 
     @property
     def digest(self) -> str:
-        """Short hash of names, units and sizes: a policy is made for one layout only."""
+        """Short hash of names, units and sizes, which a policy is bound to."""
         parts = [*SCALARS, *PREVIEW_BOUNDS, self.preview_steps, float(self.preview_period)]
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
     def tracking_part(self, observation: Any) -> NDArray[np.float32]:
-        """The tracking observation (..., size) in one that has more beside it.
+        """Return the tracking observation (..., size) from an observation with further parts.
 
-        `observation` is a dictionary with the entry `tracking`, or a vector that begins with it,
-        alone or in rows.
+        `observation` is a dictionary with the entry `tracking`, or a vector, or rows of vectors,
+        that begin with it.
         """
         if isinstance(observation, Mapping):
             observation = observation["tracking"]
         return np.asarray(observation)[..., : self.size]
 
     def unpack(self, observation: ArrayLike) -> TrackingObservation:
-        """Take a vector (size,) or a batch (n, size) apart.
+        """Split a vector (size,) or a batch (n, size) into its parts.
 
         Raises
         ------

@@ -1,7 +1,7 @@
-"""Reward of path tracking: small named terms, each normalised by a scale and weighted.
+"""Reward of path tracking: a sum of named terms, each weighted and normalised by a scale.
 
 With h the control period and rho(z) = sqrt(1 + z^2) - 1 (pseudo-Huber: quadratic near zero, linear
-far out, so it never flattens)::
+far from it, so that its slope never vanishes)::
 
     progress    =  w_progress ds / v_ref        seconds of the reference covered in this step
     lateral     = -w_lateral  h rho(e_y / lateral_scale)
@@ -10,8 +10,8 @@ far out, so it never flattens)::
     input_rate  = -w_input    h ((da/dt / jerk_scale)^2 + (ddelta/dt / steering_rate_scale)^2)
     end         = -w_end      once, if the episode ends other than by finishing or time
 
-Perfect tracking gives 1 a second. Progress sums to the reference's duration however fast it is
-covered and to nothing when parked, so neither rushing nor parking pays.
+Perfect tracking gives 1 per second. The progress of a whole path sums to the reference's duration
+at any speed, and that of a parked vehicle to 0, so that neither rushing nor parking pays.
 """
 
 from dataclasses import dataclass, fields
@@ -28,7 +28,7 @@ TERMS = ("progress", "lateral", "heading", "speed", "input_rate", "end")
 
 @dataclass(frozen=True)
 class RewardWeights:
-    """Weights and scales of the reward's terms, see the module."""
+    """Weights and scales of the reward's terms, see `lpv_track_env.reward`."""
 
     progress: float = 1.0
     lateral: float = 1.0
@@ -50,13 +50,13 @@ class RewardWeights:
                 raise ValueError(f"reward weight {field.name} must not be {value!r}")
 
     def as_array(self) -> NDArray[np.float64]:
-        """Weights and scales in field order, shape (11,), as `terms` takes them."""
+        """Return weights and scales in field order, shape (11,), as `terms` takes them."""
         return np.array([getattr(self, field.name) for field in fields(self)], dtype=np.float64)
 
 
 @compiled_internal
 def pseudo_huber(z: Any) -> Any:
-    """sqrt(1 + z^2) - 1."""
+    """Return sqrt(1 + z^2) - 1."""
     return np.sqrt(1.0 + z * z) - 1.0
 
 
@@ -73,7 +73,7 @@ def terms(
     steering_rate: Any,
     failed: Any,
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """Terms in the order of `TERMS`; `weights` (11,) as `RewardWeights.as_array` gives them."""
+    """Return the terms in the order of `TERMS`; `weights` are `RewardWeights.as_array`'s."""
     return (
         weights[0] * progress / max(reference_speed, 0.1),
         -weights[1] * period * pseudo_huber(lateral_error / weights[6]),

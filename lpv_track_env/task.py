@@ -1,4 +1,4 @@
-"""What an environment is made for: path, vehicle, periods, limits, as its kernels take them."""
+"""Task of an environment: path, vehicle, periods, limits, and their numbers for the kernels."""
 
 import math
 import warnings
@@ -40,7 +40,7 @@ def reference(
     speed_mode: str,
     fixed_speed: float | None,
 ) -> ReferencePath:
-    """Load the path that is tracked, its speed by the mode and lowered to the vehicle's range."""
+    """Load the path to track; set its speed by the mode, at most the vehicle's highest speed."""
     path = trajectories.load(trajectory)
     choose("speed_mode", speed_mode, SPEED_MODES)
     if speed_mode == "fixed":
@@ -53,14 +53,14 @@ def reference(
     fastest = parameters.speed_range[1]
     if path.speed.max() > fastest:
         message = f"path {path.name!r}: speed lowered to the vehicle's {fastest:g} m/s"
-        warnings.warn(message, UserWarning, stacklevel=3)
+        warnings.warn(message, UserWarning, stacklevel=4)
         noted = [*path.metadata.get("warnings", []), message]
         path = path.with_speed(np.minimum(path.speed, fastest), warnings=noted)
     return path
 
 
 def action_space(vehicles: Sequence[VehicleParameters]) -> spaces.Space[NDArray[np.float32]]:
-    """Box of [a m/s^2, delta rad], float32, that every vehicle's range of actions fits in."""
+    """Return the smallest box of [a m/s^2, delta rad], float32, with every vehicle's actions."""
     lows = [(car.acceleration_range[0], -car.max_steering_angle) for car in vehicles]
     highs = [(car.acceleration_range[1], car.max_steering_angle) for car in vehicles]
     low: NDArray[np.float32] = np.min(lows, axis=0).astype(np.float32)
@@ -70,10 +70,7 @@ def action_space(vehicles: Sequence[VehicleParameters]) -> spaces.Space[NDArray[
 
 @dataclass(frozen=True)
 class Task:
-    """Settings of path tracking, shared by every environment on these kernels.
-
-    Fields are those of `PathTrackingEnv`, resolved.
-    """
+    """Settings of path tracking: the arguments of `PathTrackingEnv`, resolved."""
 
     path: ReferencePath
     vehicle: VehicleParameters
@@ -85,7 +82,7 @@ class Task:
     initial_error_range: tuple[float, ...] = (0.0, 0.0, 0.0)
     random_start: bool = False
     conditions: Conditions | None = None
-    """None: the ideal ones, `simulation`."""
+    """None under "simulation"."""
 
     def __post_init__(self) -> None:
         checked_period(self.control_period)
@@ -100,7 +97,7 @@ class Task:
 
     @property
     def substeps(self) -> int:
-        """Integration steps in a control period."""
+        """Number of integration steps in a control period."""
         return math.ceil(self.control_period / longest_substep(self.vehicle) - 1e-9)
 
     @property
@@ -111,12 +108,12 @@ class Task:
 
     @property
     def start_range(self) -> float:
-        """Episodes start at arc lengths from 0 up to here, m; an open path leaves some to drive."""
+        """Largest arc length of a start, m; on open paths a fifth of the length is left."""
         share = 1.0 if self.path.closed else 0.8
         return share * self.path.length if self.random_start else 0.0
 
     def constants(self) -> Array:
-        """Numbers as the kernels take them, shape (CONSTANTS_SIZE,)."""
+        """Return the constants of the kernels, shape (CONSTANTS_SIZE,)."""
         car, period = self.vehicle, self.control_period
         low, high = car.acceleration_range
         return np.concatenate(

@@ -1,13 +1,15 @@
-"""Checks of what environments are given: actions, reset options, seeds, modes, threads.
+"""Checks of what environments are given: arguments, actions, reset options, seeds, threads.
 
 A check returns the value in the form that its caller works with, or raises an error of one line.
 """
 
+import functools
+import inspect
 import math
 import operator
 import os
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, ParamSpec
 
 import numba
 import numpy as np
@@ -22,6 +24,75 @@ Array = NDArray[Any]
 
 ENTRIES = ("0 (acceleration)", "1 (steering angle)")
 NUMBERS = (float, int)
+
+P = ParamSpec("P")
+
+
+def refuse_unknown(given: Iterable[str], known: tuple[str, ...]) -> None:
+    """Raise a TypeError that names the nearest argument, if a given name is not a known one."""
+    for name in given:
+        try:
+            choose("argument", name, known)
+        except ValueError as error:
+            raise TypeError(str(error)) from None
+
+
+def names_unknown(initialise: Callable[P, None]) -> Callable[P, None]:
+    """Decorate an `__init__`: an unknown keyword argument is refused as in `refuse_unknown`."""
+    known = tuple(inspect.signature(initialise).parameters)[1:]
+
+    @functools.wraps(initialise)
+    def checked(*arguments: P.args, **named: P.kwargs) -> None:
+        refuse_unknown(named, known)
+        initialise(*arguments, **named)
+
+    return checked
+
+
+def forwards_arguments(
+    inner: type, *without: str, **defaults: Any
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorate an `__init__` that takes the arguments of another class beside its own.
+
+    The decorated function has the parameters `self`, `settings`, and its own. Its callers give its
+    own and those of `inner`, by position or by name; `settings` gets those of `inner`, defaults
+    included, in a dictionary.
+
+    Parameters
+    ----------
+    inner
+        The class whose arguments are forwarded.
+    without
+        Arguments of `inner` that are not taken.
+    defaults
+        Defaults in place of those of `inner`.
+    """
+
+    def decorate(initialise: Callable[..., None]) -> Callable[..., None]:
+        instance, settings, *own = inspect.signature(initialise).parameters.values()
+        excluded = {*without, *(parameter.name for parameter in own)}
+        forwarded = [
+            parameter.replace(default=defaults.get(parameter.name, parameter.default))
+            for parameter in inspect.signature(inner).parameters.values()
+            if parameter.name not in excluded
+        ]
+        # A stable sort: what may be given by position comes first, the function's own before.
+        ordered = sorted([instance, *own, *forwarded], key=lambda parameter: parameter.kind)
+        signature = inspect.Signature(ordered)
+        known = tuple(signature.parameters)[1:]
+
+        @functools.wraps(initialise)
+        def checked(*arguments: Any, **named: Any) -> None:
+            refuse_unknown(named, known)
+            bound = signature.bind(*arguments, **named)
+            bound.apply_defaults()
+            taken = {parameter.name: bound.arguments.pop(parameter.name) for parameter in forwarded}
+            initialise(**{settings.name: taken}, **bound.arguments)
+
+        checked.__signature__ = signature  # type: ignore[attr-defined]
+        return checked
+
+    return decorate
 
 
 def two_numbers(action: Any) -> tuple[float, float]:

@@ -2,7 +2,6 @@
 
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -13,13 +12,12 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels, vector_kernels
-from lpv_track_env.conditions import Conditions, layout
+from lpv_track_env.conditions import layout
 from lpv_track_env.draws import random_key
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
-from lpv_track_env.episodes import GIVEN
+from lpv_track_env.episodes import GIVEN, episode_infos, final_infos, single_info
 from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.plants import BICYCLE
-from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task, action_space
 from lpv_track_env.validation import (
     checked_actions,
@@ -27,10 +25,10 @@ from lpv_track_env.validation import (
     checked_mode,
     checked_seeds,
     checked_threads,
+    forwards_arguments,
     given_start,
     listed,
 )
-from lpv_track_env.vector_infos import episode_infos, final_infos, single_info
 from lpv_track_env.vector_kernels import (
     ConditionArrays,
     EnvArrays,
@@ -38,8 +36,6 @@ from lpv_track_env.vector_kernels import (
     shares,
     using_threads,
 )
-from lpv_track_env.vehicle import VehicleParameters
-from trajectories import ReferencePath
 from trajectories.compilation import entry_point
 from trajectories.naming import choose
 
@@ -60,7 +56,7 @@ NOT_BEGUN = np.uint64(2**64 - 1)
 
 
 class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
-    """`num_envs` vehicles follow reference paths: `PathTrackingEnv`, many at once.
+    """Many vehicles follow reference paths: `num_envs` environments `PathTrackingEnv` at once.
 
     `gymnasium.make_vec("lpv_track_env/PathTracking-v0", num_envs=n,
     vectorization_mode="vector_entry_point", ...)` makes one. It behaves as Gymnasium's
@@ -69,12 +65,13 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
 
     ## Seeds
 
-    Environment i of `reset(seed=s)` is a single environment of `reset(seed=s + i)`, also over the
-    episodes that follow, whatever n is and in which order they end. A list gives each its own.
+    Environment i after `reset(seed=s)` equals a single environment after `reset(seed=s + i)`, also
+    in later episodes, whatever n is and in whichever order episodes end. A list of seeds gives each
+    environment its own.
 
     ## Autoreset
 
-    `metadata["autoreset_mode"]` says which of Gymnasium's modes holds:
+    `metadata["autoreset_mode"]` is one of Gymnasium's modes:
 
     | mode | an environment that has ended |
     |---|---|
@@ -84,31 +81,31 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
 
     ## Infos
 
-    Those of the single environment as arrays over environments, `reward_terms` a dictionary of
-    them; each `key` with a mask `_key` of the environments that it holds for (masks of one call
-    may be one array). `end` only in steps in which an episode ended.
+    Those of the single environment as arrays over environments, `reward_terms` as a dictionary of
+    arrays; each `key` has a mask `_key` of the environments that it is valid for (the masks of one
+    call may be the same array). `end` is there only in steps in which an episode ended.
 
     ## Errors
 
-    An action that is not finite, of a wrong shape or type, is a ValueError that names environment
-    and entry, and leaves all episodes untouched. A step before `reset`, or in mode `DISABLED` of an
-    environment that has ended, is a `gymnasium.error.ResetNeeded`.
+    An action that is not finite or of a wrong shape or type raises a ValueError that names
+    environment and entry, and leaves all episodes untouched. A step before `reset`, or in mode
+    `DISABLED` of an environment that has ended, raises `gymnasium.error.ResetNeeded`.
 
     ## Arguments
 
-    Those of `PathTrackingEnv` (rendering: "rgb_array" only, a frame an environment; plant:
+    Those of `PathTrackingEnv` (render mode "rgb_array" only, with a frame per environment; plant
     "bicycle" only), and
 
     num_envs
         n, number of environments.
     trajectory, vehicle
-        May be sequences too: every reset of an environment then draws one of each, uniformly. The
-        action space is the widest of the vehicles'; each vehicle's actuators clip to its own.
+        May be sequences, too: every reset of an environment then draws one of each, uniformly. The
+        action space covers those of all vehicles; each vehicle's actuators clip to its own.
     autoreset_mode
         `gymnasium.vector.AutoresetMode` or its value.
     threads
-        Threads of a step, 1 by default; more pay from some 1000 environments on. Results do not
-        depend on it.
+        Threads of a step, 1 by default; more are faster from about 1000 environments on. Results
+        do not depend on them.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  declared so by gymnasium
@@ -116,50 +113,29 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
+    @forwards_arguments(PathTrackingEnv)
     def __init__(
         self,
+        settings: dict[str, Any],
         num_envs: int = 1,
-        trajectory: str | Path | ReferencePath | Sequence[str | Path | ReferencePath] = "T1",
-        vehicle: str | Path | VehicleParameters | Sequence[str | Path | VehicleParameters] = (
-            "m2-minibus"
-        ),
-        speed_mode: str = "variable",
-        fixed_speed: float | None = None,
-        conditions: str | Conditions | dict[str, Any] = "simulation",
-        control_period: float = 0.05,
-        render_mode: str | None = None,
         *,
-        preview_steps: int = 20,
-        preview_period: float | None = None,
-        reward_weights: RewardWeights | None = None,
-        max_lateral_error: float = 5.0,
-        time_limit: float | None = None,
-        initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        random_start: bool = False,
-        plant: str = BICYCLE,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int = 1,
     ) -> None:
         if operator.index(num_envs) < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
-        if plant != BICYCLE:
+        if (plant := settings["plant"]) != BICYCLE:
             raise ValueError(
                 f"the compiled vector environment drives plant={BICYCLE!r} only, not {plant!r}: "
                 "make_vec with vectorization_mode='sync' or 'async' takes every plant"
             )
-        if render_mode is not None:
-            choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
-        paths: list[str | Path | ReferencePath] = listed("trajectory", trajectory)
-        cars: list[str | Path | VehicleParameters] = listed("vehicle", vehicle)
+        self.render_mode = settings["render_mode"]
+        if self.render_mode is not None:
+            choose("render_mode", self.render_mode, tuple(self.metadata["render_modes"]))
+        paths = listed("trajectory", settings["trajectory"])
+        cars = listed("vehicle", settings["vehicle"])
         self.num_envs = operator.index(num_envs)
-        self.render_mode = render_mode
-        self._single = PathTrackingEnv(
-            paths[0], cars[0], speed_mode, fixed_speed, conditions, control_period,
-            render_mode=render_mode, preview_steps=preview_steps, preview_period=preview_period,
-            reward_weights=reward_weights, max_lateral_error=max_lateral_error,
-            time_limit=time_limit, initial_error_range=initial_error_range,
-            random_start=random_start,
-        )  # fmt: skip
+        self._single = PathTrackingEnv(**settings | {"trajectory": paths[0], "vehicle": cars[0]})
         self.autoreset_mode = checked_mode(autoreset_mode)
         self._mode = MODES[self.autoreset_mode]
         self.metadata = {**self._single.metadata, **self.metadata}
@@ -184,18 +160,18 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             constants=nothing, tables=nothing, rows=nothing, draws=draws,
         )  # fmt: skip
         self._conditions: ConditionArrays | None = None
-        scratch = vector_kernels.SCRATCH_SIZE
+        final_vehicles, scratch = nothing, vector_kernels.SCRATCH_SIZE
         if given is not None:
             vehicle_size = layout.vehicle_size(given, self._single.control_period)
             self._conditions = ConditionArrays(np.zeros((n, vehicle_size)), nothing)
-            scratch = filtering.WORK
+            final_vehicles, scratch = np.zeros((n, vehicle_size)), filtering.WORK
         self._pack(self.tasks)
         self._step = StepArrays(
             commands=np.zeros((n, 2)),
             rewards=np.zeros(n),
             final_records=np.zeros((n, kernels.RECORD_SIZE)),
             final_observations=np.zeros((n, size), dtype=np.float32),
-            final_reports=np.zeros((n, len(layout.REPORTED))),
+            final_vehicles=final_vehicles,
         )
         self._scratch = np.zeros((shares(self._threads), scratch))
         self._advance: Callable[..., Any] | None = None
@@ -216,7 +192,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         tables = [tasks[0].path.table]
         rows, first = [(0, len(tables[0]))], 0
         for task in tasks[1:]:
-            # Vehicles mostly share a path's table, and they stand beside one another in the list.
+            # Vehicles mostly share a path's table and are neighbours in the list.
             if not np.array_equal(task.path.table, tables[-1]):
                 first += len(tables[-1])
                 tables.append(task.path.table)
@@ -231,7 +207,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             self._conditions = self._conditions._replace(specs=np.stack(specs))
 
     def task_of(self, index: int) -> Task:
-        """Task of the current episode of environment `index`: its path, its vehicle."""
+        """Return the task of the current episode of environment `index`: its path, its vehicle."""
         return self._packed[int(self._arrays.cases[index])]
 
     @property
@@ -252,12 +228,12 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
 
     @property
     def single(self) -> PathTrackingEnv:
-        """A single environment of the same settings, the first path and vehicle: for agents."""
+        """A single environment with the same settings, first path and first vehicle, for agents."""
         return self._single
 
     @property
     def arrays(self) -> EnvArrays:
-        """Arrays of the current episodes, not copies, for compiled code that steps them itself."""
+        """Arrays of the current episodes, not copies, for compiled code that steps them."""
         return self._arrays
 
     @property
@@ -267,23 +243,22 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
 
     @property
     def records(self) -> Array:
-        """Records of the current episodes, (n, `kernels.RECORD_SIZE`), to read."""
+        """Records of the current episodes, (n, `kernels.RECORD_SIZE`), not to be written."""
         return self._arrays.records
 
     def info_of(self, index: int) -> Infos:
-        """Info of environment `index`, as the single environment gives it, without its end."""
+        """Return the info of environment `index`, as in a single environment, without its end."""
         info = single_info(self.records[index])
         if self._conditions is not None:
-            report = self._conditions.vehicles[index, list(layout.REPORTED)]
-            info.update(layout.single_report(report))
+            info.update(layout.info_of(self._conditions.vehicles[index]))
         return info
 
     def final_of(self, index: int) -> tuple[Infos, Array]:
-        """Last info and observation of environment `index`, which just ended in SAME_STEP."""
+        """Return the last info and observation of environment `index`, just ended in SAME_STEP."""
         record = self._step.final_records[index]
         info = {**single_info(record), "end": kernels.END_NAMES[int(record[kernels.END])]}
         if self._conditions is not None:
-            info.update(layout.single_report(self._step.final_reports[index]))
+            info.update(layout.info_of(self._step.final_vehicles[index]))
         return info, self._step.final_observations[index].copy()
 
     @property
@@ -294,7 +269,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Infos | None = None
     ) -> tuple[Array, Infos]:
-        """Begin episodes: of all environments, or of those that `options["reset_mask"]` marks.
+        """Begin episodes of all environments, or of those that `options["reset_mask"]` marks.
 
         The other options are those of `PathTrackingEnv` and hold for every episode that begins.
 
@@ -302,7 +277,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         ------
         ValueError, TypeError
             For an unknown or impossible option, a mask of a wrong shape or type, or seeds that are
-            not one for each environment. Nothing is changed then.
+            not one for each environment. Nothing changes then.
         """
         options = dict(options or {})
         mask = checked_mask(options.pop("reset_mask", None), self.num_envs)
@@ -325,7 +300,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         return self._arrays.observations.copy(), self._infos(mask)
 
     def _pack_beside(self, extra: list[Task], mask: Array) -> None:
-        """Pack the constructor's tasks, `extra` ones, and what unmarked episodes still use."""
+        """Pack the constructor's tasks, `extra` ones, and those that unmarked episodes use."""
         fixed = len(self.tasks)
         used = sorted({case for case in self._arrays.cases[~mask].tolist() if case >= fixed})
         if not extra and len(self._packed) == fixed + len(used):
@@ -337,7 +312,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self._pack([*self.tasks, *extra, *kept])
 
     def _take_keys(self, seeds: Sequence[int | None], mask: Array) -> None:
-        """Give every environment that begins a new key where it is seeded or has none yet."""
+        """Draw a new key for every marked environment that is seeded or has none yet."""
         draws = self._arrays.draws
         for i in np.flatnonzero(mask).tolist():
             seed = seeds[i]
@@ -355,20 +330,19 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             last = self._step
             infos.update(final_infos(last.final_records, last.final_observations, ended))
             if self._conditions is not None:
-                infos["final_info"].update(layout.reports_infos(last.final_reports, ended))
+                infos["final_info"].update(layout.infos_of(last.final_vehicles, ended))
         return observations, rewards, terminated, truncated, infos
 
     def _infos(self, mask: Array | None = None) -> Infos:
-        """Infos of the current episodes of the environments that `mask` (n,) marks, or of all."""
+        """Return infos of the environments that `mask` (n,) marks, or of all."""
         infos = episode_infos(self.records, mask)
         if self._conditions is not None:
             shown = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask
-            reports = self._conditions.vehicles[:, layout.REPORTED]
-            infos.update(layout.reports_infos(reports, shown))
+            infos.update(layout.infos_of(self._conditions.vehicles, shown))
         return infos
 
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array]:
-        """`step` without infos, for those who do not read them."""
+        """Step as `step` does, without making infos."""
         self._check_order()
         envs, step = self._arrays, self._step
         step.commands[:] = checked_actions(
@@ -416,7 +390,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         Parameters
         ----------
         notes
-            Of each environment, as in `PathTrackingEnv.show_agent`.
+            Notes of each environment, as in `PathTrackingEnv.show_agent`.
 
         Raises
         ------
@@ -433,7 +407,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         )
 
     def close_extras(self, **_: Any) -> None:
-        """Free what drawing took."""
+        """Close the renderer."""
         self._single.close()
 
     def __getstate__(self) -> dict[str, Any]:

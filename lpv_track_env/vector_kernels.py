@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
-from lpv_track_env.conditions import layout
 from lpv_track_env.conditions.episode import begin_under_conditions, drive_under_conditions
 from lpv_track_env.draws import choice
 from lpv_track_env.episodes import TRAJECTORY_DRAW, VEHICLE_DRAW, begin
@@ -71,12 +70,12 @@ class StepArrays(NamedTuple):
     """(n, RECORD_SIZE), last records of the episodes that ended, in SAME_STEP."""
     final_observations: Array
     """(n, size) float32, likewise."""
-    final_reports: Array
-    """(n, 9) as `conditions.layout.REPORTED` lists them, likewise; unused without conditions."""
+    final_vehicles: Array
+    """Last vehicles under conditions, (n, size), likewise; else (0, 0)."""
 
 
 LANES = 32
-"""Vehicles in a block."""
+"""Number of vehicles in a block."""
 
 # Rows of the scratch, each LANES long: state, then
 COS, SIN, ACCELERATION, STEERING, COS_STEERING, SIN_STEERING, PARAMETERS = (
@@ -86,12 +85,12 @@ SUBSTEP, CLIPPED, PUSH, SUBSTEPS = 18 * LANES, 19 * LANES, 20 * LANES, 21 * LANE
 SCRATCH_SIZE = 22 * LANES
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)
-"""When an environment that has ended is reset, as `gymnasium.vector.AutoresetMode` says."""
+"""Modes of `gymnasium.vector.AutoresetMode`: when an environment that has ended is reset."""
 
 
 @compiled_internal
 def integrate_lanes(b: Array, substeps: int) -> None:
-    """Runge-Kutta steps of all lanes of a scratch, the same number for each."""
+    """Integrate all lanes of the scratch `b` by the same number of Runge-Kutta steps."""
     for j in range(LANES):
         half = 0.5 * b[SUBSTEP + j]
         b[PUSH + j] = b[ACCELERATION + j] * half
@@ -118,7 +117,7 @@ def integrate_lanes(b: Array, substeps: int) -> None:
 
 @compiled_inline
 def load_lane(b: Array, j: int, record: Array, action: Array, p: Array) -> None:
-    """Copy a vehicle into lane j: state, what its actuators give, parameters, substeps."""
+    """Copy a vehicle into lane j: state, actuators after the command, parameters, substeps."""
     a, delta, bits = k.actuate(
         action[0], action[1], record[k.ACCELERATION], record[k.STEERING],
         p[k.MAX_STEERING], p[k.STEERING_STEP], p[k.LOWEST_ACCELERATION],
@@ -139,7 +138,7 @@ def load_lane(b: Array, j: int, record: Array, action: Array, p: Array) -> None:
 
 @compiled_internal
 def integrate_one(b: Array, j: int, record: Array, p: Array) -> None:
-    """Integrate lane j alone: for blocks whose vehicles need different numbers of substeps."""
+    """Integrate lane j alone, for blocks whose vehicles need different numbers of substeps."""
     substeps = int(p[k.SUBSTEPS])
     vx, vy, psi, r, x, y = integrate(
         record[VX], record[VY], record[PSI], record[YAW_RATE], record[X], record[Y],
@@ -152,10 +151,10 @@ def integrate_one(b: Array, j: int, record: Array, p: Array) -> None:
 
 @compiled_internal
 def draw_case(drawn: Any, key: Any, episode: Any) -> Any:
-    """Draw the case of an episode, its path and its vehicle.
+    """Draw the case of an episode, that is, its path and its vehicle.
 
-    `drawn` holds the first case to draw from, the number of paths and that of vehicles; cases list
-    the combinations, vehicles side by side.
+    `drawn` holds the first case to draw from and the numbers of paths and of vehicles; the cases of
+    one path stand side by side.
     """
     case, paths, vehicles = drawn
     if paths > 1:
@@ -191,15 +190,6 @@ def copy(source: Array, target: Array) -> None:
 
 
 @compiled_internal
-def copy_report(vehicle: Array, report: Array) -> None:
-    """Copy what infos show of a vehicle under conditions, in the order of `layout.REPORTED`."""
-    for j in range(6):
-        report[j] = vehicle[layout.ESTIMATE + j]
-    report[6] = vehicle[layout.DEVIATION]
-    report[7], report[8] = vehicle[layout.STOPPING], vehicle[layout.MISSES]
-
-
-@compiled_internal
 def integrate_block(envs: EnvArrays, commands: Array, low: int, lanes: int, b: Array) -> None:
     """Integrate the `lanes` environments from `low` on over a control period, in scratch `b`."""
     uniform = True
@@ -220,17 +210,17 @@ def advance(
     first: int, last: int, mode: int, envs: EnvArrays, conditions: Any, step: StepArrays,
     drawn: Any, given: Array, b: Array,
 ) -> None:  # fmt: skip
-    """One control period of the environments `first` to `last` - 1, with autoreset.
+    """Drive the environments `first` to `last` - 1 one control period, with autoreset.
 
-    In NEXT_STEP an environment that has ended begins anew instead, with reward 0. In SAME_STEP one
-    that ends begins anew at once, and the `final_` arrays of `step` keep its end.
+    In NEXT_STEP an environment that has ended begins anew instead, with reward 0. In SAME_STEP an
+    environment that ends begins anew at once, and the `final_` arrays of `step` keep its end.
 
     Parameters
     ----------
     conditions
         `ConditionArrays`, or None: numba compiles one version for each.
     drawn, given
-        As `draw_case` and `kernels.begin` take them, for the episodes that begin.
+        As `draw_case` and `episodes.begin` take them, for the episodes that begin.
     b
         Scratch: (SCRATCH_SIZE,), or (`filter.WORK`,) under conditions.
     """
@@ -267,8 +257,8 @@ def advance(
                     copy(record, step.final_records[i])
                     copy(observation, step.final_observations[i])
                     if conditions is not None:
-                        copy_report(conditions.vehicles[i], step.final_reports[i])
-            # One call for both modes: every call is compiled in.
+                        copy(conditions.vehicles[i], step.final_vehicles[i])
+            # One call for both modes, since every call is inlined.
             if begins:
                 begin_next(i, envs, conditions, drawn, given)
 

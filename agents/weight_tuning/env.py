@@ -1,6 +1,5 @@
 """`lpv_track_env/WeightTuning-v0`: an NMPC drives, the action chooses its weights."""
 
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -9,11 +8,9 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from agents.weight_tuning.choice import WeightChoice
-from agents.weight_tuning.vector_env import WeightTuningVectorEnv
-from lpv_track_env.conditions import Conditions
-from lpv_track_env.env import RESET_OPTIONS
-from lpv_track_env.vehicle import VehicleParameters
-from trajectories import ReferencePath
+from agents.weight_tuning.vector_env import NOT_TAKEN, WeightTuningVectorEnv
+from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
+from lpv_track_env.validation import forwards_arguments
 from trajectories.naming import choose
 
 Array = NDArray[Any]
@@ -79,34 +76,19 @@ class WeightTuningEnv(gymnasium.Env[NDArray[np.float32], Any]):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
+    @forwards_arguments(PathTrackingEnv, *NOT_TAKEN, conditions="realtime")
     def __init__(
         self,
-        trajectory: str | Path | ReferencePath = "T1",
-        vehicle: str | Path | VehicleParameters = "m2-minibus",
-        speed_mode: str = "variable",
-        fixed_speed: float | None = None,
-        conditions: str | Conditions | dict[str, Any] = "realtime",
-        control_period: float = 0.05,
-        render_mode: str | None = None,
+        settings: dict[str, Any],
         *,
         choice: WeightChoice | None = None,
         delay_compensation: bool | None = None,
-        preview_steps: int = 20,
-        preview_period: float | None = None,
-        max_lateral_error: float = 5.0,
-        time_limit: float | None = None,
-        initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        random_start: bool = False,
     ) -> None:
         self.drives = WeightTuningVectorEnv(
-            1, trajectory, vehicle, speed_mode, fixed_speed, conditions, control_period,
-            render_mode, choice=choice, delay_compensation=delay_compensation,
-            preview_steps=preview_steps, preview_period=preview_period,
-            max_lateral_error=max_lateral_error, time_limit=time_limit,
-            initial_error_range=initial_error_range, random_start=random_start,
-            autoreset_mode=AutoresetMode.DISABLED,
+            1, choice=choice, delay_compensation=delay_compensation,
+            autoreset_mode=AutoresetMode.DISABLED, **settings,
         )  # fmt: skip
-        self.choice, self.render_mode = self.drives.choice, render_mode
+        self.choice, self.render_mode = self.drives.choice, self.drives.render_mode
         self.observation_space = self.drives.single_observation_space
         self.action_space = self.drives.single_action_space
         self.metadata = {**self.metadata, "render_fps": self.drives.metadata["render_fps"]}

@@ -230,7 +230,7 @@ def drive_rows(
             if conditions is not None:
                 now = record[k.STEPS] * period
                 free_at = conditions.vehicles[row, conditions_layout.FREE_AT]
-                busy = free_at > now + conditions_layout.INSTANT
+                busy = free_at > now + conditions_layout.TIME_TOLERANCE
             if busy:
                 # The computer still works on an earlier command: the last one stays in force.
                 push_command(commands, commands[0, 0], commands[0, 1])

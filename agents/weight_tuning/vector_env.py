@@ -1,7 +1,6 @@
 """`WeightTuning-v0`, many at once: vehicles with an NMPC each, whose weights are chosen."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -22,16 +21,16 @@ from agents.weight_tuning.decision import Decider
 from agents.weight_tuning.score import FAILED, failed, marginal_parts, parts_of, scores_of
 from agents.weights import in_words
 from lpv_track_env import kernels as k
-from lpv_track_env.conditions import Conditions
-from lpv_track_env.validation import checked_mask, checked_mode
+from lpv_track_env.env import PathTrackingEnv
+from lpv_track_env.episodes import END_NAMES
+from lpv_track_env.validation import checked_mask, checked_mode, forwards_arguments
 from lpv_track_env.vector_env import PathTrackingVectorEnv
-from lpv_track_env.vector_infos import NAMES
-from lpv_track_env.vehicle import VehicleParameters
-from trajectories import ReferencePath
 
 Array = NDArray[Any]
 Infos = dict[str, Any]
 
+NOT_TAKEN = ("reward_weights", "plant", "render_colour")
+"""Arguments of `PathTrackingEnv` that the weight-tuning environments do not take."""
 END_WINDOWS = 10.0
 """Windows of the worst score that the end of a drive that fails costs."""
 
@@ -61,45 +60,28 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
+    @forwards_arguments(PathTrackingEnv, *NOT_TAKEN, conditions="realtime")
     def __init__(
         self,
+        settings: dict[str, Any],
         num_envs: int = 1,
-        trajectory: str | Path | ReferencePath | Sequence[str | Path | ReferencePath] = "T1",
-        vehicle: str | Path | VehicleParameters | Sequence[str | Path | VehicleParameters] = (
-            "m2-minibus"
-        ),
-        speed_mode: str = "variable",
-        fixed_speed: float | None = None,
-        conditions: str | Conditions | dict[str, Any] = "realtime",
-        control_period: float = 0.05,
-        render_mode: str | None = None,
         *,
         choice: WeightChoice | None = None,
         delay_compensation: bool | None = None,
-        preview_steps: int = 20,
-        preview_period: float | None = None,
-        max_lateral_error: float = 5.0,
-        time_limit: float | None = None,
-        initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        random_start: bool = False,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int = 1,
     ) -> None:
         self.choice = WeightChoice() if choice is None else choice
         self.drives = PathTrackingVectorEnv(
-            num_envs, trajectory, vehicle, speed_mode, fixed_speed, conditions, control_period,
-            render_mode, preview_steps=preview_steps, preview_period=preview_period,
-            max_lateral_error=max_lateral_error, time_limit=time_limit,
-            initial_error_range=initial_error_range, random_start=random_start,
-            autoreset_mode=AutoresetMode.DISABLED, threads=threads,
-        )  # fmt: skip
+            num_envs, autoreset_mode=AutoresetMode.DISABLED, threads=threads, **settings
+        )
         agent: Any = agents.make(
             "lpv-nmpc", self.drives.single, delay_compensation=delay_compensation
         )
-        self._decider = Decider(self.choice, (), control_period)
+        self._decider = Decider(self.choice, (), self.drives.single.control_period)
         self.loop = ClosedLoop(self.drives, agent, decider=self._decider, threads=threads)
         self.num_envs = self.drives.num_envs
-        self.render_mode = render_mode
+        self.render_mode = self.drives.render_mode
         self.autoreset_mode = checked_mode(autoreset_mode)
         self.metadata = {
             **self.metadata, "autoreset_mode": self.autoreset_mode,
@@ -227,7 +209,7 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         infos.update({f"_{name}": mask for name in list(infos)})
         if ended is not None and ended.any():
             ends = self.drives.arrays.ends
-            infos["end"] = np.where(ended, NAMES[ends], np.array(None))
+            infos["end"] = np.where(ended, END_NAMES[ends], np.array(None))
             infos["score"] = np.where(ended, scores_of(Tally(*self._sums), ends), 0.0)
             infos["_end"] = infos["_score"] = ended
         return infos

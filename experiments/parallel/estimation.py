@@ -10,7 +10,7 @@ from experiments.parallel.mailbox import Reader, Writer
 from experiments.parallel.processes import ATTACHED, READY, Link, quiet
 from experiments.parallel.setup import ESTIMATE, MS_PER_SECOND, SAMPLE, Setup
 from lpv_track_env import vehicle
-from lpv_track_env.conditions.layout import WORST_OFFSET
+from lpv_track_env.conditions.layout import MAX_STEERING_OFFSET
 from lpv_track_env.estimation.estimator import Estimator
 
 LINK_PERIOD = 0.02
@@ -82,7 +82,7 @@ class Ekf:
         record["fix_age"] = estimator.fix_age
         if self._calibrate:
             offset = float(estimator.biases[2])
-            record["steering_offset"] = min(max(offset, -WORST_OFFSET), WORST_OFFSET)
+            record["steering_offset"] = min(max(offset, -MAX_STEERING_OFFSET), MAX_STEERING_OFFSET)
         record["fixes_used"] = counts["fixes_used"]
         record["fixes_refused"] = sum(
             n for name, n in counts.items() if name.startswith("fixes_") and name != "fixes_used"

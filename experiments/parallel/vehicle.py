@@ -18,9 +18,8 @@ from experiments.parallel.setup import (
     Setup,
     undelayed,
 )
-from lpv_track_env import sensors
 from lpv_track_env.bicycle import PSI, VX, YAW_RATE, X, Y
-from lpv_track_env.conditions import IDEAL, SIMULATION, Conditions, load
+from lpv_track_env.conditions import IDEAL, SIMULATION, Conditions, load, sensors
 from lpv_track_env.env import PathTrackingEnv
 
 Array = NDArray[np.float64]
@@ -171,7 +170,7 @@ class Vehicle:
 
 
 class Sensors:
-    """Sensors of the vehicle, each at its own rate, with the errors of `lpv_track_env.sensors`.
+    """Sensors of the vehicle, each at its own rate, with the errors of `conditions.sensors`.
 
     Without conditions they are perfect; `fix_ms` (ms) is the time between fixes.
     """

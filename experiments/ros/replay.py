@@ -27,7 +27,7 @@ from experiments.ros.topics import (
     Topic,
     WheelSpeed,
 )
-from lpv_track_env.conditions.layout import WORST_OFFSET
+from lpv_track_env.conditions.layout import MAX_STEERING_OFFSET
 from lpv_track_env.estimation.estimator import Estimator, EstimatorSettings
 from lpv_track_env.estimation.observer import PathObserver
 from lpv_track_env.vehicle import VehicleParameters
@@ -263,7 +263,7 @@ def replay(
     for k, now in enumerate(stamps.tolist()):
         feeder.feed(now)
         state = estimator.state
-        offset = float(np.clip(estimator.biases[2], -WORST_OFFSET, WORST_OFFSET))
+        offset = float(np.clip(estimator.biases[2], -MAX_STEERING_OFFSET, MAX_STEERING_OFFSET))
         acceleration, steering_angle = inputs.before(now)
         observation = observer.observe(state, acceleration, steering_angle + offset)
         proposed = [math.nan, math.nan]

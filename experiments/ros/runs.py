@@ -19,7 +19,7 @@ from experiments.ros.topics import (
 )
 from experiments.run.rollout import Trace
 from lpv_track_env.conditions import Conditions
-from lpv_track_env.sensors import Sensors
+from lpv_track_env.conditions.sensors import Sensors
 from trajectories.geodesy import geodetic
 
 T = TypeVar("T", bound=Topic)
@@ -100,7 +100,7 @@ def measured(
 ) -> dict[str, Topic]:
     """Return topics with the sensor errors of some conditions in /imu, /wheel_speed and /fix.
 
-    The errors are those of `lpv_track_env.sensors`: noise, biases, gyroscope drift, a scale error
+    The errors are those of `conditions.sensors`: noise, biases, gyroscope drift, a scale error
     of speed, and fixes that wander, drop out or are outliers. Other topics stay as they are. Fixes
     keep their stamps, since bags are read by stamp. Covariances cover white noise, not biases.
 

@@ -1,41 +1,369 @@
-"""Conditions of a drive: their fields and presets, and the compiled kernels that apply them."""
+"""Conditions of a drive: imperfections of sensors, actuators, vehicle, air and computer.
 
-from lpv_track_env.conditions.spec import (
-    DELAYS,
-    DRAWN,
-    ESTIMATORS,
-    FACTORS,
-    IDEAL,
-    LONGEST_DELAY,
-    PRESETS,
-    RANDOMISED,
-    REALTIME,
-    SIGNED,
-    SIMULATION,
-    USUAL_SPEED,
-    WIND_LEVER,
-    Actuation,
-    Conditions,
-    Range,
-    load,
+`SIMULATION` is ideal. `REALTIME` is this project's model of runs with the paper's vehicle
+(kumar2025lpv drives a minibus with GPS, IMU and wheel speed, and states no figures for them); the
+table of `Conditions` gives the reason for each number. The modules of this package are the compiled
+kernels that simulate the conditions.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lpv_track_env.estimation.estimator import EstimatorSettings
+from trajectories.naming import choose
+
+Array = NDArray[np.float64]
+Range = float | tuple[float, float]
+"""A number, or both ends of the range from which every episode draws it uniformly."""
+
+ESTIMATORS = ("ekf", "raw", "truth")
+
+
+class Actuation(NamedTuple):
+    """Delays and lags between a command and its effect, as known from the vehicle's design; s."""
+
+    computing_delay: float = 0.0
+    steering_dead_time: float = 0.0
+    steering_lag: float = 0.0
+    drive_dead_time: float = 0.0
+    drive_lag: float = 0.0
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions of a drive; every field is ideal by default.
+
+    A field that is a `Range` may be a number, or (low, high), from which every episode draws
+    uniformly with the environment's generator: domain randomisation. The third column is
+    `REALTIME`.
+
+    ======================  ======  =============  ================================================
+    field                   unit    realtime       meaning, and why that number
+    ======================  ======  =============  ================================================
+    gnss_period             s       0.1            time between fixes: 10 Hz, common for vehicles
+    gnss_latency            s       0.1            from a fix's stamp to its arrival: navigation
+                                                   engine and serial line, one period of the fixes
+    gnss_noise              m       0.03           white error of each axis: RTK receiver (10 mm +
+                                                   1 ppm stated for open sky), three times that for
+                                                   a moving vehicle between trees and buildings
+    gnss_wander             m       0.03           standard deviation of an error that lasts:
+                                                   multipath and corrections, Gauss-Markov of
+    gnss_wander_time        s       20             this time constant
+    gnss_dropout_rate       1/s     1/60           one outage a minute, under a bridge or trees
+    gnss_dropout_duration   s       0.3 to 1.5     its length
+    gnss_outlier_rate       1       0.005          share of fixes that are wrong altogether
+    gnss_outlier_size       m       3              by this distance in any direction: a float or
+                                                   single-point solution among the fixed ones
+    heading_noise           rad     0.005          0.3 degrees: two antennas 1 to 2 m apart, or AHRS
+    heading_bias            rad     -0.01 to 0.01  0.6 degrees: mounting of antennas or IMU
+    yaw_rate_noise          rad/s   0.003          MEMS gyroscope on a vehicle with its vibrations
+    yaw_rate_bias           rad/s   -3e-3 to 3e-3  0.17 degrees/s left after standstill calibration
+    yaw_rate_drift          *       1e-4           the bias's random walk, rad/s per sqrt(s)
+    speed_noise             m/s     0.05           wheel pulses over one period
+    speed_scale             1       -0.01 to 0.01  relative error: tyre radius by wear and pressure
+    steering_lag            s       0.06 to 0.12   time constant of the steering servo (first
+                                                   order): bandwidths of 1.3 to 2.7 Hz
+    steering_dead_time      s       0.02 to 0.05   from command to first motion: bus, servo cycle
+    steering_offset         rad     -0.01 to 0.01  wheels against reported angle, 0.6 degrees
+    drive_lag               s       0.15 to 0.3    time constant of drive and brakes
+    drive_dead_time         s       0.05 to 0.1    of the drive's control unit
+    mass_factor             1       0.9 to 1.25    true mass by the model's: empty to full bus. The
+                                                   drive meters a force by the model's mass
+    inertia_factor          1       0.9 to 1.25    true yaw inertia by the model's
+    front_stiffness_factor  1       0.85 to 1.15   true cornering stiffness by the model's: tyres
+    rear_stiffness_factor   1       0.85 to 1.15   differ so between makes, loads and pressures
+    rolling_factor          1       0.7 to 1.5     true rolling resistance by the model's
+    friction                1       0.6 to 1.0     of tyre and road: damp to dry asphalt; inf by
+                                                   default, a tyre that stays linear (see below)
+    wind_speed              m/s     0 to 8         mean wind, its direction drawn: fresh breeze
+    gust_speed              m/s     0 to 2         standard deviation of gusts along it, of
+    gust_time               s       3              this time constant
+    side_area               m^2     12             area times side force coefficient, of the body of
+                                                   a minibus; its centre lies `WIND_LEVER` ahead
+    computing_delay         s       5e-3 to 0.02   from reading to command: messages and scheduling,
+                                                   and the controller's own time
+    ======================  ======  =============  ================================================
+
+    Further settings:
+
+    estimator
+        Source of the observations: "ekf", the extended Kalman filter; "raw", the last fix, the
+        heading, yaw rate and speed as measured, and no lateral speed; "truth", the true state,
+        whatever the sensors' noise.
+    estimator_settings
+        Noise that the filter assumes (`lpv_track_env.estimation.estimator.EstimatorSettings`); by
+        default that of the sensors, see `filter_settings`.
+    calibrate_steering
+        True subtracts the filter's estimate of the steering offset from every command.
+    max_fix_age
+        Time without a usable fix, s, after which the vehicle brakes to a stop until there is one.
+    max_command_age
+        Time without a new command, s, after which it brakes, too; by default three control periods.
+
+    Friction limits the lateral force by the brush model (Pacejka, Tire and Vehicle Dynamics,
+    section 3.2); the bicycle gets the secant stiffness at the current slip.
+
+    A plant other than the bicycle (`lpv_track_env.plants`) has its own mass, inertia, stiffness,
+    rolling resistance, friction and wind: the fields for these have no effect.
+
+    A computation that takes longer than a control period makes the controller miss the next
+    deadline: its action is dropped, the command in force is held, and `deadline_misses` counts it.
+
+    Raises
+    ------
+    ValueError
+        For a number that is not finite or out of its range, or an unknown estimator.
+    """
+
+    name: str = "custom"
+    gnss_period: float = 0.1
+    gnss_latency: Range = 0.0
+    gnss_noise: Range = 0.0
+    gnss_wander: Range = 0.0
+    gnss_wander_time: Range = 20.0
+    gnss_dropout_rate: Range = 0.0
+    gnss_dropout_duration: Range = 1.0
+    gnss_outlier_rate: Range = 0.0
+    gnss_outlier_size: Range = 3.0
+    heading_noise: Range = 0.0
+    heading_bias: Range = 0.0
+    yaw_rate_noise: Range = 0.0
+    yaw_rate_bias: Range = 0.0
+    yaw_rate_drift: Range = 0.0
+    speed_noise: Range = 0.0
+    speed_scale: Range = 0.0
+    steering_lag: Range = 0.0
+    steering_dead_time: Range = 0.0
+    steering_offset: Range = 0.0
+    drive_lag: Range = 0.0
+    drive_dead_time: Range = 0.0
+    mass_factor: Range = 1.0
+    inertia_factor: Range = 1.0
+    front_stiffness_factor: Range = 1.0
+    rear_stiffness_factor: Range = 1.0
+    rolling_factor: Range = 1.0
+    friction: Range = math.inf
+    wind_speed: Range = 0.0
+    gust_speed: Range = 0.0
+    gust_time: Range = 3.0
+    side_area: Range = 12.0
+    computing_delay: Range = 0.0
+    estimator: str = "ekf"
+    estimator_settings: EstimatorSettings | None = None
+    calibrate_steering: bool = True
+    max_fix_age: float = 2.0
+    max_command_age: float | None = None
+
+    def __post_init__(self) -> None:
+        choose("estimator", self.estimator, ESTIMATORS)
+        for name in DRAWN:
+            object.__setattr__(self, name, _checked(name, getattr(self, name)))
+        if not 0.001 <= self.gnss_period < math.inf:
+            raise ValueError(f"conditions: gnss_period must be >= 0.001 s, not {self.gnss_period}")
+        for name in ("max_fix_age", "max_command_age"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"conditions: {name} must be positive, not {value!r}")
+
+    def replace(self, **changes: object) -> "Conditions":
+        """Return a copy with some fields changed, named "custom" unless a name is given."""
+        changed = {"name": "custom", **changes}
+        return dataclasses.replace(self, **changed)  # type: ignore[arg-type]
+
+    def ends(self, name: str) -> tuple[float, float]:
+        """Both ends of a field that may be a range."""
+        value = getattr(self, name)
+        return value if isinstance(value, tuple) else (value, value)
+
+    def middle(self, name: str) -> float:
+        """Middle of a field's range."""
+        low, high = self.ends(name)
+        return 0.5 * (low + high)
+
+    @property
+    def actuation(self) -> Actuation:
+        """Delays and lags as known beforehand: the middles of their ranges."""
+        return Actuation(*(self.middle(name) for name in Actuation._fields))
+
+    @property
+    def filter_settings(self) -> EstimatorSettings:
+        """Settings of the filter: those given, or noise at the middles of the sensors' ranges.
+
+        The wander of the fixes counts as noise, and so does the scale error of the wheel speed, at
+        `USUAL_SPEED`. The deviations of the biases are their largest values. Every deviation has a
+        lower bound.
+        """
+        if self.estimator_settings is not None:
+            return self.estimator_settings
+
+        def most(name: str) -> float:
+            return max(map(abs, self.ends(name)))
+
+        return EstimatorSettings(
+            position_deviation=math.hypot(
+                self.middle("gnss_noise"), self.middle("gnss_wander"), 0.01
+            ),
+            heading_deviation=math.hypot(self.middle("heading_noise"), 0.001),
+            yaw_rate_deviation=math.hypot(self.middle("yaw_rate_noise"), 0.001),
+            speed_deviation=math.hypot(
+                self.middle("speed_noise"), most("speed_scale") * USUAL_SPEED, 0.01
+            ),
+            initial_gyro_bias=max(most("yaw_rate_bias"), 1e-4),
+            initial_heading_bias=max(most("heading_bias"), 1e-4),
+            initial_steering_offset=max(most("steering_offset"), 1e-4),
+        )
+
+    def ranges(self) -> Array:
+        """Both ends of every field that is drawn, shape (len(DRAWN), 2), in the order of DRAWN."""
+        return np.array([self.ends(name) for name in DRAWN])
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        return dataclasses.asdict(self)
+
+
+FACTORS = frozenset(
+    {
+        "mass_factor",
+        "inertia_factor",
+        "front_stiffness_factor",
+        "rear_stiffness_factor",
+        "friction",
+        "gnss_wander_time",
+        "gust_time",
+    }
+)
+"""Fields that must be positive."""
+SIGNED = frozenset({"heading_bias", "yaw_rate_bias", "speed_scale", "steering_offset"})
+"""Fields that may be negative."""
+DELAYS = ("gnss_latency", "steering_dead_time", "drive_dead_time", "computing_delay")
+"""Fields that are at most `LONGEST_DELAY`."""
+LONGEST_DELAY = 2.0
+"""Largest delay, s: it bounds the sizes of the arrays."""
+USUAL_SPEED = 8.0
+"""Speed at which the filter's settings convert the scale error of the wheels to noise, m/s."""
+WIND_LEVER = 0.3
+"""Distance from the centre of gravity forward to the point of the side wind, m: bluff fronts."""
+
+DRAWN = tuple(item.name for item in dataclasses.fields(Conditions) if item.type in {Range, "Range"})
+"""Fields that may be ranges, in the order in which they are drawn."""
+
+
+def _checked(name: str, value: object) -> Range:
+    """Return a field's number or ordered pair of numbers as floats.
+
+    Raises
+    ------
+    ValueError
+        Naming the field.
+    """
+    try:
+        ends = tuple(map(float, value)) if isinstance(value, tuple | list) else (float(value),)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        ends = ()
+    top = math.inf if name == "friction" else math.nextafter(math.inf, 0.0)
+    if name in DELAYS:
+        top = LONGEST_DELAY
+    low = -top if name in SIGNED else 0.0
+    good = 0 < len(ends) < 3 and all(low <= end <= top for end in ends) and ends[0] <= ends[-1]
+    if good and name in FACTORS:
+        good = ends[0] > 0.0
+    if len(ends) == 2 and math.isinf(ends[1]):
+        good = False
+    if not good:
+        sign = "a number" if name in SIGNED else "positive" if name in FACTORS else ">= 0"
+        limit = f" and at most {LONGEST_DELAY:g} s" if name in DELAYS else ""
+        raise ValueError(
+            f"conditions: {name} must be {sign}{limit}, or (low, high) of such, not {value!r}"
+        )
+    return ends[0] if len(ends) == 1 else (ends[0], ends[1])
+
+
+IDEAL = Conditions("ideal", estimator="truth")
+"""Perfect in every respect, as `simulation`, but computed by the kernels of conditions."""
+
+REALTIME = Conditions(
+    "realtime",
+    gnss_latency=0.1,
+    gnss_noise=0.03,
+    gnss_wander=0.03,
+    gnss_dropout_rate=1.0 / 60.0,
+    gnss_dropout_duration=(0.3, 1.5),
+    gnss_outlier_rate=0.005,
+    heading_noise=0.005,
+    heading_bias=(-0.01, 0.01),
+    yaw_rate_noise=0.003,
+    yaw_rate_bias=(-0.003, 0.003),
+    yaw_rate_drift=1e-4,
+    speed_noise=0.05,
+    speed_scale=(-0.01, 0.01),
+    steering_lag=(0.06, 0.12),
+    steering_dead_time=(0.02, 0.05),
+    steering_offset=(-0.01, 0.01),
+    drive_lag=(0.15, 0.3),
+    drive_dead_time=(0.05, 0.1),
+    mass_factor=(0.9, 1.25),
+    inertia_factor=(0.9, 1.25),
+    front_stiffness_factor=(0.85, 1.15),
+    rear_stiffness_factor=(0.85, 1.15),
+    rolling_factor=(0.7, 1.5),
+    friction=(0.6, 1.0),
+    wind_speed=(0.0, 8.0),
+    gust_speed=(0.0, 2.0),
+    computing_delay=(0.005, 0.02),
 )
 
-__all__ = [
-    "DELAYS",
-    "DRAWN",
-    "ESTIMATORS",
-    "FACTORS",
-    "IDEAL",
-    "LONGEST_DELAY",
-    "PRESETS",
-    "RANDOMISED",
-    "REALTIME",
-    "SIGNED",
-    "SIMULATION",
-    "USUAL_SPEED",
-    "WIND_LEVER",
-    "Actuation",
-    "Conditions",
-    "Range",
-    "load",
-]
+RANDOMISED = REALTIME.replace(
+    name="randomised",
+    gnss_noise=(0.01, 0.15),
+    steering_lag=(0.05, 0.2),
+    steering_dead_time=(0.0, 0.1),
+)
+"""`REALTIME` for less well-known vehicles: receivers from RTK to metre class, fast to slow servos,
+dead times up to two periods of 0.05 s. Weights are tuned under these conditions."""
+
+SIMULATION = "simulation"
+PRESETS: dict[str, Conditions | None] = {
+    SIMULATION: None,
+    "realtime": REALTIME,
+    "randomised": RANDOMISED,
+    "ideal": IDEAL,
+}
+"""Conditions by name; None stands for the kernels without conditions."""
+
+
+def load(value: "str | Conditions | dict[str, object]") -> Conditions | None:
+    """Resolve a preset's name, a dictionary of fields, or conditions; None is `simulation`.
+
+    A dictionary may name the preset that it changes as `name`: {"name": "realtime",
+    "estimator": "raw"}.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name or field; the message lists the known ones and the nearest.
+    """
+    if isinstance(value, Conditions):
+        return value
+    if isinstance(value, dict):
+        known = tuple(item.name for item in dataclasses.fields(Conditions))
+        changes = dict(value)
+        for key in changes:
+            choose("field of conditions", key, known)
+        preset = PRESETS[choose("conditions", str(changes.pop("name", "ideal")), tuple(PRESETS))]
+        settings = changes.pop("estimator_settings", None)
+        for key in settings or {}:  # type: ignore[attr-defined]
+            choose("estimator setting", key, tuple(EstimatorSettings.__dataclass_fields__))
+        if not (changes or settings):
+            return preset
+        changed = (preset or IDEAL).replace(**changes)
+        if settings:
+            filtered = dataclasses.replace(changed.filter_settings, **settings)  # type: ignore[arg-type]
+            changed = changed.replace(estimator_settings=filtered)
+        return changed
+    return PRESETS[choose("conditions", value, tuple(PRESETS))]

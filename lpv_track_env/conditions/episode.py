@@ -1,6 +1,6 @@
-"""Compiled kernels of path tracking under conditions: one vehicle's period, beginnings, many.
+"""Compiled kernels of path tracking under conditions: control periods and beginnings of episodes.
 
-What an agent sees is made of the estimate; reward, ends and infos are made of the truth.
+Observations are computed from the estimate; rewards, ends and infos from the true state.
 """
 
 import math
@@ -17,11 +17,18 @@ from lpv_track_env.conditions.sensors import (
     begin_estimate,
     draw_conditions,
     estimate,
-    offset_of,
     read_sensors,
-    receive_satellites,
+    send_fix,
+    steering_offset,
 )
-from lpv_track_env.conditions.vehicle import blow, command_age, move, send, serve, stop_acceleration
+from lpv_track_env.conditions.vehicle import (
+    advance_gust,
+    advance_servos,
+    command_age,
+    drive_vehicle,
+    send_command,
+    stop_acceleration,
+)
 from lpv_track_env.episodes import begin
 from lpv_track_env.estimation import filter as filtering
 from trajectories.compilation import compiled, compiled_in_place, compiled_internal
@@ -32,17 +39,20 @@ Array = NDArray[Any]
 
 @compiled_in_place
 def take_command(m: Array, record: Array, a: Any, delta: Any, spec: Array, constants: Array) -> int:
-    """Begin a control period: send its command, if it can be; the bits of what was clipped."""
-    p, queue = constants, m[layout.TAIL : layout.ways_start(spec)]
+    """Begin a control period: queue its command unless the controller is busy.
+
+    Returns the bits of what the actuators clipped.
+    """
+    p, commands = constants, m[layout.TAIL : layout.fixes_start(spec)]
     ekf = m[layout.filter_start(spec) :]
     now = record[k.STEPS] * p[k.PERIOD]
     bits = 0
-    if m[layout.FREE_AT] > now + layout.INSTANT:
-        # The controller is still busy with an earlier command: it misses its turn.
+    if m[layout.FREE_AT] > now + layout.TIME_TOLERANCE:
+        # The controller is still computing an earlier command: a deadline miss.
         m[layout.MISSES] += 1.0
         m[layout.MISSED_IN_A_ROW] += 1.0
     else:
-        # Rates are limited over the time since the last command.
+        # The rate limits hold over the time since the last command.
         periods = 1.0 + m[layout.MISSED_IN_A_ROW]
         a, delta, bits = k.actuate(
             a, delta, m[layout.COMMAND_A], m[layout.COMMAND_DELTA], p[k.MAX_STEERING],
@@ -50,42 +60,45 @@ def take_command(m: Array, record: Array, a: Any, delta: Any, spec: Array, const
             periods * p[k.ACCELERATION_STEP],
         )  # fmt: skip
         m[layout.MISSED_IN_A_ROW] = 0.0
-        send(m, queue, now, a, delta, offset_of(ekf, spec))
+        send_command(m, commands, now, a, delta, steering_offset(ekf, spec))
     m[layout.LATENCY] = m[layout.OCCUPIED] = -1.0
     blind = (
         spec[layout.ESTIMATOR] == layout.EKF and ekf[filtering.FIX_AGE] > spec[layout.MAX_FIX_AGE]
     )
-    stale = command_age(m, queue, now) > spec[layout.MAX_COMMAND_AGE] + layout.INSTANT
+    stale = command_age(m, commands, now) > spec[layout.MAX_COMMAND_AGE] + layout.TIME_TOLERANCE
     m[layout.STOPPING] = 0.0
     if blind or stale:
         m[layout.STOPPING] = 1.0
-        # The drive goes on from where it is when commands count again: within the jerk limit.
+        # So that the jerk limit also holds when the vehicle follows commands again.
         m[layout.COMMAND_A] = m[layout.SERVO_A]
     return bits
 
 
 @compiled_in_place
 def end_period(
-    m: Array, record: Array, vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, bits: int,
-    spec: Array, constants: Array, table: Array, observation: Array, key: Any, episode: Any,
-    work: Array,
+    m: Array, record: Array, state: Any, bits: int, spec: Array, constants: Array, table: Array,
+    observation: Array, key: Any, episode: Any, work: Array,
 ) -> int:  # fmt: skip
-    """End a control period with a new state: errors, end, reward, sensors, estimate."""
+    """End a control period with a new true state: errors, end, reward, sensors, estimate.
+
+    `state` is the tuple (vx, vy, psi, r, X, Y).
+    """
     p, filtered = constants, layout.filter_start(spec)
-    ways, ekf = m[layout.ways_start(spec) : filtered], m[filtered:]
+    fixes, ekf = m[layout.fixes_start(spec) : filtered], m[filtered:]
+    vx, vy, psi, r, x, y = state
     end = k.finish(
         record, p, table, observation, vx, vy, psi, r, x, y, m[layout.SERVO_A],
         m[layout.SERVO_DELTA], bits,
     )  # fmt: skip
     if end == k.NON_FINITE:
-        # What was seen last stays: there is no state that sensors could read.
+        # The last observation stays, since there is no state that sensors could measure.
         return end
     now = record[k.STEPS] * p[k.PERIOD]
     draw = PERIOD_DRAW + DRAWS * int(record[k.STEPS])
     read_sensors(m, record, key, episode, draw, p[k.PERIOD])
-    receive_satellites(m, ways, record, now, key, episode, draw, spec)
-    estimate(m, ways, ekf, record, now, spec, work)
-    see(m, p, table, observation, vx * p[k.PERIOD])
+    send_fix(m, fixes, record, now, key, episode, draw, spec)
+    estimate(m, fixes, ekf, record, now, spec, work)
+    observe_estimate(m, p, table, observation, vx * p[k.PERIOD])
     return end
 
 
@@ -94,24 +107,27 @@ def drive_under_conditions(
     m: Array, record: Array, a: Any, delta: Any, spec: Array, constants: Array, table: Array,
     observation: Array, key: Any, episode: Any, work: Array,
 ) -> int:  # fmt: skip
-    """One control period of an episode under conditions, in place; the code of its end."""
+    """Drive one control period of an episode under conditions, in place; return its end's code."""
     bits = take_command(m, record, a, delta, spec, constants)
     period = constants[k.PERIOD]
-    blow(m, key, episode, PERIOD_DRAW + DRAWS * (int(record[k.STEPS]) + 1), period)
-    queue = m[layout.TAIL : layout.ways_start(spec)]
-    vx, vy, psi, r, x, y = move(m, queue, record, constants, record[k.STEPS] * period)
+    advance_gust(m, key, episode, PERIOD_DRAW + DRAWS * (int(record[k.STEPS]) + 1), period)
+    commands = m[layout.TAIL : layout.fixes_start(spec)]
+    state = drive_vehicle(m, commands, record, constants, record[k.STEPS] * period)
     return end_period(
-        m, record, vx, vy, psi, r, x, y, bits, spec, constants, table, observation, key, episode,
-        work,
-    )  # fmt: skip
+        m, record, state, bits, spec, constants, table, observation, key, episode, work
+    )
 
 
 @compiled_internal
-def see(m: Array, constants: Array, table: Array, observation: Array, ahead: Any) -> None:
-    """Find the estimate on the path and make the observation of it."""
-    # A fix may move the estimate by more than the vehicle drives in a period.
+def observe_estimate(
+    m: Array, constants: Array, table: Array, observation: Array, ahead: Any
+) -> None:
+    """Project the estimate on the path, about `ahead` m further on, and observe from there."""
+    # A fix may shift the estimate by more than the vehicle drives in a period.
     window = min(max(SEARCH_WINDOW, 1.5 * abs(ahead)), constants[k.LENGTH])
-    k.look(m[layout.ESTIMATE : layout.TAIL], constants, table, observation, ahead, window)
+    k.locate_and_observe(
+        m[layout.ESTIMATE : layout.TAIL], constants, table, observation, ahead, window
+    )
 
 
 @compiled
@@ -119,9 +135,9 @@ def begin_under_conditions(
     m: Array, record: Array, spec: Array, constants: Array, table: Array, observation: Array,
     draws: Array, given: Array,
 ) -> None:  # fmt: skip
-    """Begin an episode under conditions: draw them and the start, `given` as `episodes.begin`.
+    """Begin an episode under conditions: draw the conditions and the start.
 
-    `draws` holds key and number of the episode, (2,) uint64.
+    `draws` holds key and number of the episode, (2,) uint64; `given` is as in `episodes.begin`.
     """
     key, episode = draws[0], draws[1]
     begin(record, constants, table, observation, key, episode, given)
@@ -147,14 +163,14 @@ def begin_under_conditions(
     if spec[layout.ESTIMATOR] == layout.TRUTH:
         e[k.STEERING] += m[layout.STEERING_OFFSET]
     e[k.ARC_LENGTH] = record[k.ARC_LENGTH]
-    see(m, constants, table, observation, 0.0)
+    observe_estimate(m, constants, table, observation, 0.0)
 
 
 @compiled
 def advance_under_conditions(
     data: Array, table: Array, m: Array, spec: Array, work: Array, draws: Array
 ) -> tuple[int, Any, Any, Any, Any, int, Any, Any, Any, Any, Any, Any, Any]:
-    """`kernels.advance` under conditions: one period of a single environment, in place.
+    """Drive one period of a single environment in place, as `kernels.advance` does.
 
     `draws` holds key and number of the episode, (2,) uint64.
     """
@@ -176,20 +192,20 @@ def advance_under_conditions(
 
 @compiled
 def command_under_conditions(data: Array, m: Array, spec: Array) -> tuple[Any, Any, int]:
-    """Begin a control period of a plant that is not the kernels' bicycle.
+    """Begin a control period of a plant other than the bicycle.
 
-    Returns the mean acceleration that the drive gives over it (m/s^2), the angle at which the
-    wheels stand at its end (rad), and the bits of what was clipped.
+    Returns the mean acceleration of the drive over the period (m/s^2), the angle of the wheels at
+    its end (rad), and the bits of what the actuators clipped.
     """
     record, constants = data[k.RECORD : k.CONSTANTS], data[k.CONSTANTS : k.OBSERVATION]
     bits = take_command(m, record, data[0], data[1], spec, constants)
-    queue = m[layout.TAIL : layout.ways_start(spec)]
+    commands = m[layout.TAIL : layout.fixes_start(spec)]
     substeps, now = int(constants[k.SUBSTEPS]), record[k.STEPS] * constants[k.PERIOD]
     h = constants[k.PERIOD] / substeps
     braking = stop_acceleration(m, constants)
     m[layout.MEAN_A] = m[layout.MEAN_DELTA] = 0.0
     for i in range(substeps):
-        a, delta = serve(m, queue, braking, now + i * h, h)
+        a, delta = advance_servos(m, commands, braking, now + i * h, h)
         m[layout.MEAN_A] += a / substeps
         m[layout.MEAN_DELTA] += delta / substeps
     return m[layout.MEAN_A], m[layout.SERVO_DELTA] + m[layout.STEERING_OFFSET], bits
@@ -200,9 +216,9 @@ def conclude_under_conditions(
     data: Array, table: Array, m: Array, spec: Array, work: Array, draws: Array, state: Array,
     bits: int,
 ) -> int:  # fmt: skip
-    """End a control period that another plant has driven to a `state` (6,)."""
+    """End a control period after which another plant has reached a `state` (6,)."""
+    reached = (state[0], state[1], state[2], state[3], state[4], state[5])
     return end_period(
-        m, data[k.RECORD : k.CONSTANTS], state[0], state[1], state[2], state[3], state[4],
-        state[5], bits, spec, data[k.CONSTANTS : k.OBSERVATION], table,
-        data[k.OBSERVATION :].view(np.float32), draws[0], draws[1], work,
+        m, data[k.RECORD : k.CONSTANTS], reached, bits, spec, data[k.CONSTANTS : k.OBSERVATION],
+        table, data[k.OBSERVATION :].view(np.float32), draws[0], draws[1], work,
     )  # fmt: skip

@@ -1,8 +1,10 @@
-"""Layout of what the kernels know of a vehicle under conditions, and how conditions reach them.
+"""Arrays of a vehicle under conditions, and how conditions are written into them.
 
-A vehicle has one float64 array: what its `conditions` were drawn to, actuators, commands on their
-way, wind, sensors, the estimate as a memory of its own (`kernels`), the filter (`filtering`). An
-environment has one, its spec: the ranges to draw from, settings, sizes.
+A vehicle (`m` in the kernels) is one float64 array: the values drawn from its conditions, the true
+parameters, actuators, wind and sensors, the estimate as a record of its own (see `kernels`), the
+commands that have not landed, the fixes that have not arrived, and the filter (see
+`estimation.filter`). The conditions of an environment are one array, too, its spec: the ranges to
+draw from, settings, capacities.
 """
 
 import math
@@ -29,66 +31,73 @@ COUNT = len(DRAWN)
     FRONT_STIFFNESS_FACTOR, REAR_STIFFNESS_FACTOR, ROLLING_FACTOR, FRICTION, WIND_SPEED,
     GUST_SPEED, GUST_TIME, SIDE_AREA, COMPUTING_DELAY,
 ) = range(COUNT)  # fmt: skip
-"""The memory begins with what was drawn, in the order of `conditions.DRAWN`; then"""
+# A vehicle begins with the drawn values, in the order of `conditions.DRAWN`, then
 PLANT = COUNT
-"""the true vehicle's parameters, 7 in `PARAMETER_ORDER`;"""
+"""The true vehicle's parameters, 7 in `PARAMETER_ORDER`."""
 (
-    SERVO_A, SERVO_DELTA, COMMAND_A, COMMAND_DELTA, NEWEST, QUEUED, FREE_AT, LATENCY, OCCUPIED,
-    DEVIATION, STOPPING, MISSES, MISSED_IN_A_ROW, MEAN_A, MEAN_DELTA, WIND_X, WIND_Y, GUST,
-    WANDER_X, WANDER_Y, OUTAGE_END, NEXT_FIX, WAITING, DRIFT, FIX_X, FIX_Y, READ_SPEED,
-    READ_YAW_RATE, READ_HEADING,
+    SERVO_A, SERVO_DELTA,  # acceleration (m/s^2) and steering angle (rad) as the actuators report
+    COMMAND_A, COMMAND_DELTA,  # last accepted command
+    NEWEST, QUEUED,  # place of the newest command in the queue, number of commands in it
+    FREE_AT,  # time at which the controller is free again, s
+    LATENCY, OCCUPIED,  # measured times of the next computation, s; -1: as the conditions say
+    DEVIATION,  # standard deviation of the estimated position, m
+    STOPPING,  # 1 while the vehicle brakes to a stop
+    MISSES, MISSED_IN_A_ROW,  # deadline misses of the episode, and in a row
+    MEAN_A, MEAN_DELTA,  # mean reported inputs over the last period
+    WIND_X, WIND_Y, GUST,  # the wind's direction, and the gust along it, m/s
+    WANDER_X, WANDER_Y, OUTAGE_END, NEXT_FIX,  # GNSS: m, m, s, s
+    WAITING,  # number of fixes that have not arrived
+    DRIFT,  # drift of the yaw-rate bias, rad/s
+    FIX_X, FIX_Y, READ_SPEED, READ_YAW_RATE, READ_HEADING,  # readings of this period
 ) = range(PLANT + len(PARAMETER_ORDER), PLANT + len(PARAMETER_ORDER) + 29)  # fmt: skip
-"""actuators as they report (a, delta), last accepted command, places in the queue of commands, when
-the controller is free again (s), latency and occupation of the next computation if somebody
-measured them (s, else -1), standard deviation of the position (m), whether the vehicle brakes to a
-stop, deadline misses in all and in a row, mean reported inputs over the last period, the wind's
-direction and gust, GNSS, the readings of this period;"""
 ESTIMATE = PLANT + len(PARAMETER_ORDER) + 29
-"""the estimate, a memory as `kernels` has it;"""
+"""The estimate, a record as `kernels` lays it out."""
 TAIL = ESTIMATE + kernels.RECORD_SIZE
-"""commands on their way (landing time s, a, delta), fixes on theirs (arrival s, stamp, x, y), and
-the filter with its past."""
-COMMAND, WAY = 3, 4
-"""Numbers of a command and of a fix on its way."""
+"""The commands that have not landed, then the fixes that have not arrived, then the filter."""
+COMMAND = 3
+"""Numbers of a queued command: landing time (s), a, delta."""
+FIX = 4
+"""Numbers of a queued fix: arrival (s), stamp (s), x, y."""
 
-# A spec holds the ranges of what is drawn, (COUNT, 2), then
+# A spec holds the ranges to draw from, (COUNT, 2), then
 GNSS_PERIOD = 2 * COUNT
 MAX_FIX_AGE, MAX_COMMAND_AGE, ESTIMATOR, CALIBRATE = (
     GNSS_PERIOD + 1, GNSS_PERIOD + 2, GNSS_PERIOD + 3, GNSS_PERIOD + 4,
 )  # fmt: skip
-QUEUE_ROOM, FIX_ROOM = GNSS_PERIOD + 5, GNSS_PERIOD + 6
+COMMAND_CAPACITY, FIX_CAPACITY = GNSS_PERIOD + 5, GNSS_PERIOD + 6
 INITIAL = GNSS_PERIOD + 7
-"""the filter's initial variances, (9,), and its settings."""
+"""Initial variances of the filter, (9,)."""
 SETTINGS = INITIAL + filtering.STATES
+"""Settings of the filter."""
 SPEC = SETTINGS + filtering.SETTINGS
 
 EKF, RAW, TRUTH = range(len(ESTIMATORS))
-INSTANT = 1e-9
-"""s that are no time: rounding of sums of periods."""
-WORST_OFFSET = 0.1
-"""rad; a larger estimate of the steering offset is not believed."""
+TIME_TOLERANCE = 1e-9
+"""Tolerance for rounding in sums of periods, s."""
+MAX_STEERING_OFFSET = 0.1
+"""Bound of the estimated steering offset that is subtracted from commands, rad."""
 
 
 @compiled_internal
-def ways_start(spec: Array) -> int:
-    """Where the fixes on their way begin in a vehicle's memory, behind the commands on theirs."""
-    return TAIL + COMMAND * int(spec[QUEUE_ROOM])
+def fixes_start(spec: Array) -> int:
+    """Return the index of the queued fixes in a vehicle's array; the queued commands end there."""
+    return TAIL + COMMAND * int(spec[COMMAND_CAPACITY])
 
 
 @compiled_internal
 def filter_start(spec: Array) -> int:
-    """Where the filter's memory begins in a vehicle's."""
-    return ways_start(spec) + WAY * int(spec[FIX_ROOM])
+    """Return the index of the filter in a vehicle's array."""
+    return fixes_start(spec) + FIX * int(spec[FIX_CAPACITY])
 
 
-def rooms(conditions: Conditions, period: float) -> tuple[int, int, int]:
-    """Numbers of commands and of fixes on their way, and of the filter's nodes, that may be."""
+def capacities(conditions: Conditions, period: float) -> tuple[int, int, int]:
+    """Return the largest numbers of queued commands, of queued fixes, and of the filter's nodes."""
     slowest = conditions.ends("computing_delay")[1] + max(
         conditions.ends("steering_dead_time")[1], conditions.ends("drive_dead_time")[1]
     )
     latest = conditions.ends("gnss_latency")[1]
-    # Beside the commands on their way: the one in force, the next, and what is late if somebody
-    # measured a time that the conditions do not know of.
+    # The margin holds the command in force, the next one, and late ones if the computing time is
+    # measured and longer than the conditions say.
     return (
         math.ceil(slowest / period) + 8,
         math.ceil(latest / conditions.gnss_period) + 2,
@@ -97,17 +106,17 @@ def rooms(conditions: Conditions, period: float) -> tuple[int, int, int]:
 
 
 def vehicle_size(conditions: Conditions, period: float) -> int:
-    """Length of a vehicle's array under some conditions and a control period (s)."""
-    commands, fixes, nodes = rooms(conditions, period)
-    return TAIL + COMMAND * commands + WAY * fixes + filtering.FILTER + filtering.NODE * nodes
+    """Return the length of a vehicle's array under some conditions and a control period (s)."""
+    commands, fixes, nodes = capacities(conditions, period)
+    return TAIL + COMMAND * commands + FIX * fixes + filtering.FILTER + filtering.NODE * nodes
 
 
 def spec_of(task: Task) -> Array:
-    """Numbers as the kernels take them, shape (SPEC,), for a task under conditions."""
+    """Return the spec of a task under conditions, shape (SPEC,)."""
     conditions, period = task.conditions, task.control_period
     assert conditions is not None
     age = conditions.max_command_age
-    commands, fixes, _ = rooms(conditions, period)
+    commands, fixes, _ = capacities(conditions, period)
     return np.concatenate(
         [
             conditions.ranges().ravel(),
@@ -126,17 +135,17 @@ def spec_of(task: Task) -> Array:
     )
 
 
-class ConditionsArrays(NamedTuple):
-    """What the kernels take of one vehicle under conditions."""
+class ConditionedVehicle(NamedTuple):
+    """Arrays of one vehicle under conditions."""
 
     vehicle: Array
     spec: Array
     work: Array
-    """Working space of the filter."""
+    """Scratch of the filter, (`filter.WORK`,)."""
 
     @classmethod
-    def of(cls, task: Task) -> "ConditionsArrays | None":
-        """Arrays for a task; None under conditions `simulation`."""
+    def of(cls, task: Task) -> "ConditionedVehicle | None":
+        """Return new arrays for a task; None under conditions `simulation`."""
         if task.conditions is None:
             return None
         return cls(
@@ -146,8 +155,8 @@ class ConditionsArrays(NamedTuple):
         )
 
     def busy_at(self, now: float) -> bool:
-        """Whether the controller still computes an earlier command at `now` (s)."""
-        return bool(self.vehicle[FREE_AT] > now + INSTANT)
+        """Return whether the controller still computes an earlier command at `now` (s)."""
+        return bool(self.vehicle[FREE_AT] > now + TIME_TOLERANCE)
 
     def set_computing_time(self, latency: float, occupied: float) -> None:
         """Set latency and occupation of the next computation, s.
@@ -155,40 +164,40 @@ class ConditionsArrays(NamedTuple):
         Raises
         ------
         ValueError
-            If one is negative or longer than the memory is made for.
+            If one is negative or longer than `LONGEST_DELAY`.
         """
         if not (0.0 <= latency <= LONGEST_DELAY and 0.0 <= occupied <= LONGEST_DELAY):
             raise ValueError(f"computing times must be 0 to {LONGEST_DELAY:g} s")
         self.vehicle[LATENCY], self.vehicle[OCCUPIED] = latency, occupied
 
     def info(self) -> dict[str, Any]:
-        """What infos have besides those of ideal conditions."""
-        return single_report(self.vehicle[list(REPORTED)])
+        """Return the entries that conditions add to infos."""
+        return info_of(self.vehicle)
 
 
-REPORTED = (*range(ESTIMATE, ESTIMATE + 6), DEVIATION, STOPPING, MISSES)
-"""Entries of a memory that infos show: a report, (9,)."""
+def info_of(m: Array) -> dict[str, Any]:
+    """Return the entries that conditions add to the info of a vehicle: of its filter and commands.
 
-
-def single_report(report: Array) -> dict[str, Any]:
-    """Infos of one vehicle: estimate (6,), position_deviation, stopping, deadline_misses."""
-    deviation, stopping, misses = report[6:].tolist()
+    `estimate` (6,), `position_deviation` (m), `stopping` and `deadline_misses`.
+    """
+    deviation, stopping, misses = m[DEVIATION : MISSES + 1].tolist()
     return {
-        "estimate": report[:6].copy(),
+        "estimate": m[ESTIMATE : ESTIMATE + 6].copy(),
         "position_deviation": deviation,
         "stopping": bool(stopping),
         "deadline_misses": int(misses),
     }
 
 
-def reports_infos(reports: Array, mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """The same of many vehicles, from reports (n, 9), for those that `mask` (n,) marks."""
-    shown = np.where(mask[:, None], reports, 0.0)
+def infos_of(vehicles: Array, mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return these entries for vehicles (n, size): zeros for those that `mask` (n,) excludes."""
+    estimates, counts = vehicles[:, ESTIMATE : ESTIMATE + 6], vehicles[:, DEVIATION : MISSES + 1]
+    deviation, stopping, misses = np.where(mask[:, None], counts, 0.0).T.copy()
     infos: dict[str, Any] = {
-        "estimate": shown[:, :6].copy(),
-        "position_deviation": shown[:, 6].copy(),
-        "stopping": shown[:, 7] > 0.5,
-        "deadline_misses": shown[:, 8].astype(np.int64),
+        "estimate": np.where(mask[:, None], estimates, 0.0),
+        "position_deviation": deviation,
+        "stopping": stopping > 0.5,
+        "deadline_misses": misses.astype(np.int64),
     }
     infos.update({f"_{name}": mask for name in list(infos)})
     return infos

@@ -1,29 +1,36 @@
-"""Compiled kernels of a real vehicle's sensors, and of the estimate that is made of them."""
+"""Sensors of a vehicle under conditions, and the estimate that is made of their readings.
+
+The environments call the compiled kernels. `Sensors` makes them usable alone, for simulations with
+clocks of their own and for recorded drives.
+"""
 
 import math
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
-from lpv_track_env.conditions import layout
-from lpv_track_env.draws import gaussian, uniform
+from lpv_track_env.bicycle import PSI, STATE_SIZE, VX, VY, YAW_RATE, X, Y
+from lpv_track_env.conditions import DRAWN, Conditions, layout
+from lpv_track_env.draws import gaussian, random_key, uniform
 from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.kernels import ACCELERATION, STEERING, clip
-from trajectories.compilation import compiled_in_place, compiled_internal
+from trajectories.compilation import compiled, compiled_in_place, compiled_internal
 
 Array = NDArray[Any]
 
-# Places of an episode's draws beside those of `episodes`;
+# Numbers of an episode's draws, beside those of `episodes`.
 CONDITIONS_DRAW, DIRECTION_DRAW, FIRST_WANDER_DRAW, FIRST_GUST_DRAW, PHASE_DRAW = 16, 80, 82, 84, 86
-PERIOD_DRAW, DRAWS = 128, 64
-"""from PERIOD_DRAW on, DRAWS of them to a control period, and among these:"""
+PERIOD_DRAW = 128
+"""First draw of the control periods; each period has `DRAWS` of its own."""
+DRAWS = 64
 READINGS_DRAW, FIX_DRAW, WANDER_DRAW, OUTAGE_DRAW, OUTLIER_DRAW, DRIFT_DRAW = 0, 4, 6, 8, 10, 12
+"""Draws within a control period."""
 
 
 @compiled_in_place
 def draw_conditions(m: Array, spec: Array, key: Any, episode: Any) -> None:
-    """Draw an episode's conditions, and what has been going on when it begins."""
+    """Draw an episode's conditions, and the wander, gust and fix phase at its beginning."""
     for j in range(layout.COUNT):
         low, high = spec[2 * j], spec[2 * j + 1]
         m[j] = low
@@ -38,7 +45,7 @@ def draw_conditions(m: Array, spec: Array, key: Any, episode: Any) -> None:
     )
     first, second = gaussian(key, episode, FIRST_GUST_DRAW)
     m[layout.GUST] = m[layout.GUST_SPEED] * first
-    # Receivers do not start with the drive.
+    # The receiver has been running before: the first fix falls anywhere within its period.
     m[layout.NEXT_FIX] = spec[layout.GNSS_PERIOD] * uniform(key, episode, PHASE_DRAW)
 
 
@@ -62,8 +69,10 @@ def read_sensors(m: Array, record: Array, key: Any, episode: Any, draw: int, per
 
 
 @compiled_internal
-def sound_fix(m: Array, x: Any, y: Any, key: Any, episode: Any, draw: int) -> tuple[Any, Any]:
-    """Fix of a position with the errors that every fix has."""
+def fix_without_outlier(
+    m: Array, x: Any, y: Any, key: Any, episode: Any, draw: int
+) -> tuple[Any, Any]:
+    """Return a fix of a position with noise and wander, no outlier."""
     first, second = gaussian(key, episode, draw + FIX_DRAW)
     return (
         x + (m[layout.WANDER_X] + m[layout.GNSS_NOISE] * first),
@@ -75,7 +84,7 @@ def sound_fix(m: Array, x: Any, y: Any, key: Any, episode: Any, draw: int) -> tu
 def measure_fix(
     m: Array, x: Any, y: Any, spacing: Any, now: Any, key: Any, episode: Any, draw: int
 ) -> tuple[bool, Any, Any]:
-    """Whether there is a fix of a position, `spacing` seconds after the last was due, and which."""
+    """Return whether a position is fixed, `spacing` seconds after the last fix, and the fix (m)."""
     kept = math.exp(-spacing / m[layout.GNSS_WANDER_TIME])
     driven = m[layout.GNSS_WANDER] * math.sqrt(1.0 - kept * kept)
     first, second = gaussian(key, episode, draw + WANDER_DRAW)
@@ -86,7 +95,7 @@ def measure_fix(
     if uniform(key, episode, draw + OUTAGE_DRAW) < m[layout.GNSS_DROPOUT_RATE] * spacing:
         m[layout.OUTAGE_END] = now + m[layout.GNSS_DROPOUT_DURATION]
         return False, x, y
-    x, y = sound_fix(m, x, y, key, episode, draw)
+    x, y = fix_without_outlier(m, x, y, key, episode, draw)
     if uniform(key, episode, draw + OUTLIER_DRAW) < m[layout.GNSS_OUTLIER_RATE]:
         angle = 2.0 * math.pi * uniform(key, episode, draw + OUTLIER_DRAW + 1)
         x += m[layout.GNSS_OUTLIER_SIZE] * math.cos(angle)
@@ -95,51 +104,45 @@ def measure_fix(
 
 
 @compiled_internal
-def receive_satellites(
-    m: Array, ways: Array, record: Array, now: Any, key: Any, episode: Any, draw: int, spec: Array
+def send_fix(
+    m: Array, fixes: Array, record: Array, now: Any, key: Any, episode: Any, draw: int, spec: Array
 ) -> None:
-    """Make the fix that is due, if there is one, and put it on its way."""
+    """Measure the fix that is due, if one is, and queue it until its arrival."""
     if now < m[layout.NEXT_FIX] - 1e-9:
         return
     spacing = spec[layout.GNSS_PERIOD]
     m[layout.NEXT_FIX] = max(m[layout.NEXT_FIX] + spacing, now + 1e-6)
     there, x, y = measure_fix(m, record[X], record[Y], spacing, now, key, episode, draw)
     at = int(m[layout.WAITING])
-    if there and (at + 1) * layout.WAY <= ways.shape[0]:
-        place = at * layout.WAY
-        ways[place], ways[place + 1] = now + m[layout.GNSS_LATENCY], now
-        ways[place + 2], ways[place + 3] = x, y
+    if there and (at + 1) * layout.FIX <= fixes.shape[0]:
+        place = at * layout.FIX
+        fixes[place], fixes[place + 1] = now + m[layout.GNSS_LATENCY], now
+        fixes[place + 2], fixes[place + 3] = x, y
         m[layout.WAITING] += 1.0
 
 
 @compiled_internal
-def arrived(m: Array, ways: Array, now: Any) -> Any:
-    """Whether the oldest fix on its way has arrived."""
-    return m[layout.WAITING] > 0.5 and ways[0] <= now + 1e-9
-
-
-@compiled_internal
-def drop_first(m: Array, ways: Array) -> None:
-    """Take the oldest fix off the list."""
+def drop_first(m: Array, fixes: Array) -> None:
+    """Remove the oldest fix from the queue."""
     m[layout.WAITING] -= 1.0
-    for j in range(int(m[layout.WAITING]) * layout.WAY):
-        ways[j] = ways[j + layout.WAY]
+    for j in range(int(m[layout.WAITING]) * layout.FIX):
+        fixes[j] = fixes[j + layout.FIX]
 
 
 @compiled_internal
-def offset_of(ekf: Array, spec: Array) -> Any:
-    """Steering offset that is taken off the commands, rad."""
+def steering_offset(ekf: Array, spec: Array) -> Any:
+    """Return the steering offset that is subtracted from the commands, rad."""
     if spec[layout.CALIBRATE] < 0.5 or spec[layout.ESTIMATOR] != layout.EKF:
         return 0.0
-    offset = ekf[filtering.STEERING_OFFSET]
-    return clip(offset, -layout.WORST_OFFSET, layout.WORST_OFFSET)
+    limit = layout.MAX_STEERING_OFFSET
+    return clip(ekf[filtering.STEERING_OFFSET], -limit, limit)
 
 
 @compiled_in_place
 def estimate(
-    m: Array, ways: Array, ekf: Array, record: Array, now: Any, spec: Array, work: Array
+    m: Array, fixes: Array, ekf: Array, record: Array, now: Any, spec: Array, work: Array
 ) -> None:
-    """Make the estimate of this control period's end from what was read and what has arrived."""
+    """Estimate the state at the end of a control period from its readings and arrived fixes."""
     e = m[layout.ESTIMATE : layout.TAIL]
     kind = int(spec[layout.ESTIMATOR])
     if kind == layout.EKF:
@@ -148,13 +151,13 @@ def estimate(
             ekf, now, m[layout.MEAN_A], m[layout.MEAN_DELTA], m[layout.READ_SPEED],
             m[layout.READ_YAW_RATE], m[layout.READ_HEADING], settings, work,
         )  # fmt: skip
-    while arrived(m, ways, now):
-        m[layout.FIX_X], m[layout.FIX_Y] = ways[2], ways[3]
+    while m[layout.WAITING] > 0.5 and fixes[0] <= now + 1e-9:
+        m[layout.FIX_X], m[layout.FIX_Y] = fixes[2], fixes[3]
         if kind == layout.EKF:
-            filtering.take_fix(ekf, ways[1], ways[2], ways[3], spec[layout.SETTINGS :], work)
-        drop_first(m, ways)
+            filtering.take_fix(ekf, fixes[1], fixes[2], fixes[3], spec[layout.SETTINGS :], work)
+        drop_first(m, fixes)
     e[ACCELERATION] = m[layout.SERVO_A]
-    e[STEERING] = m[layout.SERVO_DELTA] + offset_of(ekf, spec)
+    e[STEERING] = m[layout.SERVO_DELTA] + steering_offset(ekf, spec)
     if kind == layout.EKF:
         for j in range(6):
             e[j] = ekf[j]
@@ -172,10 +175,12 @@ def estimate(
 def begin_estimate(
     m: Array, ekf: Array, record: Array, key: Any, episode: Any, draw: int, spec: Array
 ) -> None:
-    """Begin from a first fix, heading and speed, read on the spot (at 0 s); no outlier."""
+    """Begin the estimate from readings at 0 s: a fix without outlier, heading and speed."""
     kind = int(spec[layout.ESTIMATOR])
     e = m[layout.ESTIMATE : layout.TAIL]
-    m[layout.FIX_X], m[layout.FIX_Y] = sound_fix(m, record[X], record[Y], key, episode, draw)
+    m[layout.FIX_X], m[layout.FIX_Y] = fix_without_outlier(
+        m, record[X], record[Y], key, episode, draw
+    )
     read_sensors(m, record, key, episode, draw, 0.0)
     for j in range(6):
         e[j] = record[j]
@@ -193,8 +198,96 @@ def begin_estimate(
         f[j] = e[j]
     for j in range(filtering.STATES):
         f[filtering.COVARIANCE + 10 * j] = spec[layout.INITIAL + j]
-    # Heading and yaw rate were read: their errors are those of the biases, with the other sign.
+    # Heading and yaw rate were measured: their errors are minus those of the biases.
     filtering.correlate(f, PSI, filtering.HEADING_BIAS)
     filtering.correlate(f, YAW_RATE, filtering.GYRO_BIAS)
     filtering.begin_filter(f, 0.0)
     m[layout.DEVIATION] = filtering.position_deviation(f)
+
+
+@compiled
+def _draw(m: Array, spec: Array, key: Any) -> None:
+    draw_conditions(m, spec, key, 0)
+
+
+@compiled
+def _read(m: Array, state: Array, key: Any, draw: int, period: Any) -> None:
+    read_sensors(m, state, key, 0, draw, period)
+
+
+@compiled
+def _fix(
+    m: Array, x: Any, y: Any, spacing: Any, now: Any, key: Any, draw: int
+) -> tuple[bool, Any, Any]:
+    if now < 0.0:
+        first, second = fix_without_outlier(m, x, y, key, 0, draw)
+        return True, first, second
+    return measure_fix(m, x, y, spacing, now, key, 0, draw)
+
+
+class Sensors:
+    """GNSS, IMU and wheel speed of one vehicle, with the errors of some conditions.
+
+    Every call draws the errors of one reading; equal calls with equal seeds give equal readings.
+    Readings come at once: the caller has to delay fixes by `drawn["gnss_latency"]` (s).
+
+    Parameters
+    ----------
+    conditions
+        Ranges are drawn once.
+    seed
+        Seed of all draws.
+    """
+
+    def __init__(self, conditions: Conditions, seed: int = 0) -> None:
+        # The kernels of sensors read only the ranges and the period of the fixes.
+        spec = np.zeros(layout.SPEC)
+        spec[: 2 * layout.COUNT] = conditions.ranges().ravel()
+        spec[layout.GNSS_PERIOD] = conditions.gnss_period
+        self._key = random_key(np.random.default_rng(seed))
+        self._vehicle, self._state = np.zeros(layout.TAIL), np.zeros(STATE_SIZE)
+        self._calls = 0
+        self._inertial_time = self._fix_time = 0.0
+        _draw(self._vehicle, spec, self._key)
+
+    @property
+    def drawn(self) -> dict[str, float]:
+        """Values drawn from the conditions' ranges, by field."""
+        return dict(zip(DRAWN, self._vehicle[: len(DRAWN)].tolist(), strict=True))
+
+    def inertial(self, time: float, heading: float, yaw_rate: float) -> tuple[float, float]:
+        """Return heading (rad) and yaw rate (rad/s) as the IMU measures them at `time` (s)."""
+        self._state[PSI], self._state[YAW_RATE] = heading, yaw_rate
+        self._read(max(time - self._inertial_time, 0.0))
+        self._inertial_time = time
+        m = self._vehicle
+        return float(m[layout.READ_HEADING]), float(m[layout.READ_YAW_RATE])
+
+    def wheel_speed(self, speed: float) -> float:
+        """Return the speed (m/s) as the wheels measure it."""
+        self._state[VX] = speed
+        self._read(0.0)
+        return float(self._vehicle[layout.READ_SPEED])
+
+    def first_fix(self, x: float, y: float) -> tuple[float, float]:
+        """Return a fix (m) from before the drive, without outage or outlier."""
+        _, measured_x, measured_y = _fix(
+            self._vehicle, float(x), float(y), 0.0, -1.0, self._key, self._next()
+        )
+        return measured_x, measured_y
+
+    def fix(self, time: float, x: float, y: float) -> tuple[float, float] | None:
+        """Return the fix (m) of a position at `time` (s, from 0 on), or None in an outage."""
+        there, measured_x, measured_y = _fix(
+            self._vehicle, float(x), float(y), max(time - self._fix_time, 0.0), float(time),
+            self._key, self._next(),
+        )  # fmt: skip
+        self._fix_time = time
+        return (measured_x, measured_y) if there else None
+
+    def _read(self, period: float) -> None:
+        _read(self._vehicle, self._state, self._key, self._next(), float(period))
+
+    def _next(self) -> int:
+        self._calls += 1
+        return PERIOD_DRAW + DRAWS * self._calls

@@ -1,4 +1,4 @@
-"""Compiled kernels of a real vehicle: late commands, lagging actuators, other tyres, wind."""
+"""Compiled kernels of a vehicle under conditions: late commands, lags, friction, wind."""
 
 import math
 from typing import Any
@@ -18,15 +18,15 @@ Array = NDArray[Any]
 AIR_DENSITY = 1.225
 """kg/m^3, standard atmosphere at sea level."""
 GUST_DRAW = 32
-"""Place of the gust's draw among those of a control period, see `conditions_sensors`."""
+"""Number of the gust's draw within a control period, see `conditions.sensors`."""
 STOP_DECELERATION = 2.0
-"""m/s^2 of a controlled stop."""
+"""Deceleration of a controlled stop, m/s^2."""
 
 
 def controlled_stop(rolling_deceleration: Any, max_jerk: Any, speed: Any) -> Any:
-    """Acceleration command (m/s^2) that brakes from a speed >= 0 (m/s) down to standstill.
+    """Return the acceleration command (m/s^2) that brakes from a speed >= 0 (m/s) to standstill.
 
-    Half the jerk limit (m/s^3) brings deceleration and speed to zero together.
+    Half the jerk limit (m/s^3) brings deceleration and speed to zero at the same time.
     """
     return rolling_deceleration - min(STOP_DECELERATION, math.sqrt(max_jerk * speed))
 
@@ -35,8 +35,8 @@ compiled_controlled_stop = compiled_internal(controlled_stop)
 
 
 @compiled_internal
-def send(m: Array, queue: Array, now: Any, a: Any, delta: Any, offset: Any) -> None:
-    """Send a command made from readings at `now`, its steering less an offset: it lands later."""
+def send_command(m: Array, commands: Array, now: Any, a: Any, delta: Any, offset: Any) -> None:
+    """Queue a command made from readings at `now` (s), its steering angle less `offset` (rad)."""
     latency, occupied = m[layout.LATENCY], m[layout.OCCUPIED]
     if latency < 0.0:
         latency = m[layout.COMPUTING_DELAY]
@@ -45,29 +45,29 @@ def send(m: Array, queue: Array, now: Any, a: Any, delta: Any, offset: Any) -> N
     m[layout.FREE_AT] = now + occupied
     m[layout.COMMAND_A], m[layout.COMMAND_DELTA] = a, delta
     landing = now + latency
-    room = queue.shape[0] // layout.COMMAND
+    room = commands.shape[0] // layout.COMMAND
     newest = int(m[layout.NEWEST])
-    # One that lands before those sent earlier takes their place.
-    while m[layout.QUEUED] > 1.0 and queue[newest * layout.COMMAND] >= landing:
+    # A command that lands before earlier ones replaces them.
+    while m[layout.QUEUED] > 1.0 and commands[newest * layout.COMMAND] >= landing:
         newest = (newest - 1 + room) % room
         m[layout.QUEUED] -= 1.0
     newest = (newest + 1) % room
-    queue[newest * layout.COMMAND] = landing
-    queue[newest * layout.COMMAND + 1] = a
-    queue[newest * layout.COMMAND + 2] = delta - offset
+    commands[newest * layout.COMMAND] = landing
+    commands[newest * layout.COMMAND + 1] = a
+    commands[newest * layout.COMMAND + 2] = delta - offset
     m[layout.NEWEST] = newest
     m[layout.QUEUED] = min(m[layout.QUEUED] + 1.0, float(room))
 
 
 @compiled_internal
-def held(m: Array, queue: Array, entry: int, begins: Any, ends: Any) -> Any:
-    """Mean of a command's entry (1: a, 2: delta) over a time, s, as it came in."""
-    room = queue.shape[0] // layout.COMMAND
+def mean_command(m: Array, commands: Array, entry: int, begins: Any, ends: Any) -> Any:
+    """Return the mean of an entry (1: a, 2: delta) of the commands in force over a time, s."""
+    room = commands.shape[0] // layout.COMMAND
     at, left = int(m[layout.NEWEST]), int(m[layout.QUEUED])
     total, end, value = 0.0, ends, 0.0
     while left > 0 and end > begins:
-        value = queue[at * layout.COMMAND + entry]
-        landing = queue[at * layout.COMMAND]
+        value = commands[at * layout.COMMAND + entry]
+        landing = commands[at * layout.COMMAND]
         if landing < end:
             start = max(landing, begins)
             total += (end - start) * value
@@ -80,10 +80,10 @@ def held(m: Array, queue: Array, entry: int, begins: Any, ends: Any) -> Any:
 
 @compiled_internal
 def secant(stiffness: Any, slip: Any, limit: Any) -> Any:
-    """Lateral force per slip angle at a slip (rad), up to `limit` (N): the brush model's.
+    """Return the secant stiffness (N/rad) of the brush model at a slip (rad), force limit in N.
 
-    F = C a (1 - z + z^2/3) with z = C |a| / (3 limit) up to z = 1, where all slides. (Pacejka, Tire
-    and Vehicle Dynamics, section 3.2, parabolic pressure.)
+    F = C a (1 - z + z^2/3) with z = C |a| / (3 limit) up to z = 1, where the whole contact patch
+    slides. (Pacejka, Tire and Vehicle Dynamics, section 3.2, parabolic pressure.)
     """
     if not math.isfinite(limit):
         return stiffness
@@ -94,8 +94,8 @@ def secant(stiffness: Any, slip: Any, limit: Any) -> Any:
 
 
 @compiled_internal
-def blow(m: Array, key: Any, episode: Any, draw: int, period: Any) -> None:
-    """Let the wind's gust go on by a period: first order, of stationary deviation."""
+def advance_gust(m: Array, key: Any, episode: Any, draw: int, period: Any) -> None:
+    """Advance the gust by a period (s): a stationary first-order Gauss-Markov process."""
     kept = math.exp(-period / m[layout.GUST_TIME])
     first, _ = gaussian(key, episode, draw + GUST_DRAW)
     m[layout.GUST] = (
@@ -105,10 +105,10 @@ def blow(m: Array, key: Any, episode: Any, draw: int, period: Any) -> None:
 
 @compiled_internal
 def side_wind(m: Array, vx: Any, vy: Any, psi: Any) -> tuple[Any, Any]:
-    """Lateral (m/s^2) and yaw acceleration (rad/s^2) by the wind.
+    """Return the lateral (m/s^2) and yaw acceleration (rad/s^2) caused by the wind.
 
-    F = rho/2 A |v| v_y with the air's velocity v in the body's frame: the side force coefficient
-    goes with the sine of the flow's angle.
+    F = rho/2 A |v| v_y with the air's velocity v in the body frame: the side force coefficient is
+    proportional to the sine of the angle of the flow.
     """
     c, s = math.cos(psi), math.sin(psi)
     wind = m[layout.WIND_SPEED] + m[layout.GUST]
@@ -120,18 +120,21 @@ def side_wind(m: Array, vx: Any, vy: Any, psi: Any) -> tuple[Any, Any]:
 
 
 @compiled_internal
-def command_age(m: Array, queue: Array, now: Any) -> Any:
-    """Time since the command in force came in, s."""
-    room = queue.shape[0] // layout.COMMAND
+def command_age(m: Array, commands: Array, now: Any) -> Any:
+    """Return the time since the command in force landed, s."""
+    room = commands.shape[0] // layout.COMMAND
     at, left = int(m[layout.NEWEST]), int(m[layout.QUEUED])
-    while left > 1 and queue[at * layout.COMMAND] > now:
+    while left > 1 and commands[at * layout.COMMAND] > now:
         at, left = (at - 1 + room) % room, left - 1
-    return now - queue[at * layout.COMMAND]
+    return now - commands[at * layout.COMMAND]
 
 
 @compiled_internal
 def stop_acceleration(m: Array, constants: Array) -> Any:
-    """Acceleration that brakes to a stop by the estimated speed, within the jerk limit, m/s^2."""
+    """Return the acceleration (m/s^2) that brakes to a stop, within the jerk limit.
+
+    The vehicle knows its speed from the estimate only.
+    """
     speed = max(m[layout.ESTIMATE + VX], 0.0)
     jerk = constants[k.ACCELERATION_STEP] / constants[k.PERIOD]
     wanted = compiled_controlled_stop(constants[6], jerk, speed)
@@ -139,21 +142,25 @@ def stop_acceleration(m: Array, constants: Array) -> Any:
 
 
 @compiled_internal
-def serve(m: Array, queue: Array, braking: Any, begins: Any, h: Any) -> tuple[Any, Any]:
-    """Let the servos work for h seconds; means of what they report over them, a and delta.
+def advance_servos(m: Array, commands: Array, braking: Any, begins: Any, h: Any) -> tuple[Any, Any]:
+    """Advance the servos by h seconds; return the means of their outputs a and delta.
 
-    First order, exactly; the means are what an integrator that holds its inputs wants. `braking` is
-    the acceleration of a vehicle that stops by itself.
+    The first-order lags are solved exactly; the integrator, which holds its inputs, takes the
+    means. `braking` is the acceleration of a vehicle that brakes to a stop.
     """
     lag, ends, dead = m[layout.DRIVE_LAG], begins + h, m[layout.DRIVE_DEAD_TIME]
     kept = math.exp(-h / lag) if lag > 0.0 else 0.0
-    wanted = braking if m[layout.STOPPING] > 0.5 else held(m, queue, 1, begins - dead, ends - dead)
+    wanted = (
+        braking
+        if m[layout.STOPPING] > 0.5
+        else mean_command(m, commands, 1, begins - dead, ends - dead)
+    )
     behind = m[layout.SERVO_A] - wanted
     a = wanted + behind * ((1.0 - kept) * lag / h)
     m[layout.SERVO_A] = wanted + behind * kept
     lag, dead = m[layout.STEERING_LAG], m[layout.STEERING_DEAD_TIME]
     kept = math.exp(-h / lag) if lag > 0.0 else 0.0
-    wanted = held(m, queue, 2, begins - dead, ends - dead)
+    wanted = mean_command(m, commands, 2, begins - dead, ends - dead)
     behind = m[layout.SERVO_DELTA] - wanted
     delta = wanted + behind * ((1.0 - kept) * lag / h)
     m[layout.SERVO_DELTA] = wanted + behind * kept
@@ -161,10 +168,10 @@ def serve(m: Array, queue: Array, braking: Any, begins: Any, h: Any) -> tuple[An
 
 
 @compiled_in_place
-def move(
-    m: Array, queue: Array, record: Array, constants: Array, now: Any
+def drive_vehicle(
+    m: Array, commands: Array, record: Array, constants: Array, now: Any
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """State after a control period of the real vehicle; notes servos and mean inputs in `m`."""
+    """Return the true state after a control period; writes servos and mean inputs into `m`."""
     p, q = constants, layout.PLANT
     substeps = int(p[k.SUBSTEPS])
     h = p[k.PERIOD] / substeps
@@ -175,7 +182,7 @@ def move(
     windy = m[layout.WIND_SPEED] > 0.0 or m[layout.GUST_SPEED] > 0.0
     braking = stop_acceleration(m, p)
     for i in range(substeps):
-        a, delta = serve(m, queue, braking, now + i * h, h)
+        a, delta = advance_servos(m, commands, braking, now + i * h, h)
         total_a += a
         total_delta += delta
         wheels = delta + m[layout.STEERING_OFFSET]
@@ -185,7 +192,7 @@ def move(
         push = spin = 0.0
         if windy:
             push, spin = side_wind(m, vx, vy, psi)
-        # Half the wind's push before and half after the step (Strang): second order.
+        # Half of the wind's impulse before the step and half after it: Strang splitting, order 2.
         vx, vy, psi, r, x, y = integrate(
             vx, vy + 0.5 * h * push, psi, r + 0.5 * h * spin, x, y,
             a / m[layout.MASS_FACTOR], wheels,

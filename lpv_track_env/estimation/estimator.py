@@ -1,6 +1,6 @@
-"""Where the vehicle is, from what its sensors say: an extended Kalman filter, usable alone.
+"""Estimator of a vehicle's state from its sensors: an extended Kalman filter, usable alone.
 
-The environments run the same compiled filter (`filtering`) inside their observation path.
+The environments run the same compiled filter (`estimation.filter`) to make observations.
 """
 
 import math
@@ -18,39 +18,39 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EstimatorSettings:
-    """What the filter believes of its sensors and of its model: standard deviations.
+    """Standard deviations that the filter assumes for its sensors and its model.
 
-    The defaults belong to the sensors of the conditions `realtime` (`lpv_track_env.conditions`).
+    The defaults fit the sensors of the conditions `realtime` (`lpv_track_env.conditions`).
 
     Parameters
     ----------
     position_deviation
-        Of a fix, each axis, m.
+        Noise of a fix on each axis, m.
     heading_deviation
-        Of a heading reading beside its bias, rad.
+        Noise of a heading reading, rad, without the bias.
     yaw_rate_deviation
-        Of a yaw-rate reading beside its bias, rad/s.
+        Noise of a yaw-rate reading, rad/s, without the bias.
     speed_deviation
-        Of a wheel-speed reading, m/s.
+        Noise of a wheel-speed reading, m/s.
     speed_noise, lateral_speed_noise
-        Of the model's vx and vy: what accumulates over one second, m/s.
+        Process noise of vx and vy, accumulated over one second, m/s.
     yaw_rate_noise
-        Of the model's yaw rate, over one second, rad/s.
+        Process noise of the yaw rate, over one second, rad/s.
     heading_noise
-        Of psi' = r, over one second, rad.
+        Process noise of psi, over one second, rad.
     position_noise
-        Of X and Y, over one second, m; errors of the fixes that last longer than a second are
-        part of it.
+        Process noise of X and Y, over one second, m; it includes errors of the fixes that last
+        longer than a second.
     gyro_bias_noise, heading_bias_noise, steering_offset_noise
         Random walks of the biases over one second: rad/s, rad, rad.
     initial_gyro_bias, initial_heading_bias, initial_steering_offset
-        Deviations of the biases when the filter begins: rad/s, rad, rad.
+        Initial deviations of the biases: rad/s, rad, rad.
     fix_gate
         Largest NIS of a fix that is used: chi-square of 2 degrees of freedom, 0.9999 by default.
     reading_gate
         Largest NIS of any other reading: chi-square of 1 degree of freedom, 0.99994 by default.
     most_rejected
-        Rejections of one sensor in a row after which it is believed.
+        Rejections of one sensor in a row after which its readings are used nevertheless.
 
     Raises
     ------
@@ -87,7 +87,7 @@ class EstimatorSettings:
                 raise ValueError(f"estimator: {field.name} must be positive")
 
     def as_array(self, vehicle: VehicleParameters) -> Array:
-        """Numbers as the kernels take them, shape (`filtering.SETTINGS`,)."""
+        """Return the settings of the kernels, shape (`filter.SETTINGS`,)."""
         return np.array(
             [
                 self.position_deviation**2,
@@ -112,11 +112,11 @@ class EstimatorSettings:
 
     @property
     def initial_variances(self) -> Array:
-        """Of the filter's nine states when it begins from one set of readings, shape (9,)."""
+        """Variances of the nine states after the first readings, shape (9,)."""
         deviations = [
             self.speed_deviation,
             self.lateral_speed_noise,
-            # The first heading is a reading: its error is the bias and the noise.
+            # The first heading is a reading: its error consists of bias and noise.
             math.hypot(self.heading_deviation, self.initial_heading_bias),
             math.hypot(self.yaw_rate_deviation, self.initial_gyro_bias),
             self.position_deviation,
@@ -129,18 +129,19 @@ class EstimatorSettings:
 
 
 class Estimator:
-    """Extended Kalman filter of one vehicle, for logs and for a vehicle's own computer.
+    """Extended Kalman filter of one vehicle, for logs and for the computer of a vehicle.
 
     Parameters
     ----------
     vehicle
-        The vehicle as its model knows it.
+        Parameters of the model.
     settings
         Noise, gates.
     memory
-        Longest lateness of a fix that can still be used, s.
+        Largest delay of a fix that is still used, s.
     period
-        Time between calls of `advance` that `memory` is sized for, s; calls may come at any time.
+        Expected time between calls of `advance`, s, which sizes the filter's past; calls may come
+        at any time.
 
     Examples
     --------
@@ -169,7 +170,7 @@ class Estimator:
         self._begun = False
 
     def begin(self, time: float, x: float, y: float, heading: float, speed: float) -> None:
-        """Begin at `time` (s) from first readings: m, m, rad, m/s; going straight.
+        """Begin at `time` (s) from first readings in m, m, rad, m/s, driving straight.
 
         Raises
         ------
@@ -181,7 +182,7 @@ class Estimator:
         m, states = self._filter, filtering.STATES
         m[:states] = [speed, 0.0, heading, 0.0, x, y, 0.0, 0.0, 0.0]
         covariance = np.diag(self.settings.initial_variances)
-        # The heading was read: its error is that of the bias, with the other sign.
+        # The heading was measured: its error is minus that of the bias.
         covariance[PSI, filtering.HEADING_BIAS] -= self.settings.initial_heading_bias**2
         covariance[filtering.HEADING_BIAS, PSI] -= self.settings.initial_heading_bias**2
         m[states : states + states**2] = covariance.ravel()
@@ -198,16 +199,16 @@ class Estimator:
         yaw_rate: float = math.nan,
         speed: float = math.nan,
     ) -> None:
-        """Predict to `time`, then take in what was read there; NaN for what was not.
+        """Predict to `time`, then update with the readings there; NaN for a missing one.
 
         Parameters
         ----------
         time
-            s; not before that of the last call. A call for the same time adds readings.
+            s, not before the time of the last call. A call for the same time adds readings.
         acceleration, steering_angle
             Mean inputs in force since the last call, as the actuators report them: m/s^2, rad.
         heading, yaw_rate, speed
-            IMU and wheels: rad, rad/s, m/s. Beyond its gate a reading is left out and counted.
+            IMU and wheels: rad, rad/s, m/s. A reading beyond its gate is rejected and counted.
 
         Raises
         ------
@@ -225,13 +226,13 @@ class Estimator:
         )  # fmt: skip
 
     def take_fix(self, stamp: float, x: float, y: float) -> str:
-        """Take in a fix of the position (m) that was true at `stamp` (s), however late it comes.
+        """Update with a fix of the position (m) at `stamp` (s), however late it comes.
 
         Returns
         -------
         str
-            "used"; "gated", beyond its gate; "late", older than the filter's memory or than a fix
-            that came before it, or a second one for a step; "duplicate"; or "not finite".
+            "used"; "gated", beyond its gate; "late", older than `memory` or than an earlier fix, or
+            the second one for a step; "duplicate"; or "not finite".
         """
         self._check_begun()
         code = filtering.take_fix(
@@ -267,7 +268,7 @@ class Estimator:
     @property
     def position_deviation(self) -> float:
         """Standard deviation of the position in its worst direction, m."""
-        return float(filtering.deviation_of(self._filter, 0))
+        return float(filtering.deviation_of(self._filter))
 
     @property
     def fix_age(self) -> float:
@@ -276,18 +277,18 @@ class Estimator:
 
     @property
     def fix_nis(self) -> float:
-        """Normalised innovation squared of the last fix (2 degrees of freedom); NaN before one."""
+        """Normalised innovation squared of the last fix (2 degrees of freedom); NaN if none."""
         return float(self._filter[filtering.FIX_NIS])
 
     @property
     def reading_nis(self) -> tuple[float, int]:
-        """NIS of the last call's other readings together, and how many these were."""
+        """NIS of the last call's other readings, summed, and their number."""
         m = self._filter
         return float(m[filtering.READING_NIS]), int(m[filtering.READINGS])
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many fixes and readings were used and refused since `begin`, by what came of them."""
+        """Numbers of fixes and readings since `begin`, by outcome."""
         f = filtering
         rows = {
             "fixes_used": f.FIXES_USED,

@@ -1,17 +1,17 @@
-"""Compiled kernels of the estimator: an extended Kalman filter on the bicycle's own vector field.
+"""Compiled kernels of the estimator: an extended Kalman filter on the bicycle's vector field.
 
-State of the filter, (9,): the vehicle's [vx, vy, psi, r, X, Y], then the bias of the yaw-rate
-sensor (rad/s), that of the heading sensor (rad), and the steering offset (rad: the wheels stand at
-the reported angle plus this). Biases are random walks. Model of the readings::
+State of the filter, (9,): the vehicle's [vx, vy, psi, r, X, Y], the bias of the yaw-rate sensor
+(rad/s), the bias of the heading sensor (rad), and the steering offset (rad: the wheels' angle is
+the reported angle plus the offset). Biases are random walks. Model of the readings::
 
     speed = vx        yaw rate = r + gyro bias        heading = psi + heading bias
     fix = (X, Y)
 
-Readings are taken in one after another, which for independent noise is the same as at once; one
-whose normalised innovation squared (NIS) lies beyond its gate is left out. The last nodes of the
-past are kept, so a fix that comes late is taken in at the node of its stamp, and what followed is
-computed anew (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
-Navigation, 2001: sections 5.4 and 10.3).
+Scalar updates follow one another, which for independent noise equals one joint update. A reading
+whose normalised innovation squared (NIS) exceeds its gate is rejected. The filter keeps its last
+nodes: a late fix updates the node of its stamp, and the nodes after that are computed anew
+(Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001:
+sections 5.4 and 10.3).
 """
 
 import math
@@ -28,48 +28,51 @@ Array = NDArray[Any]
 
 GYRO_BIAS, HEADING_BIAS, STEERING_OFFSET = 6, 7, 8
 STATES = 9
+# Array of a filter (`m`), float64: state, covariance (81, row by row), counters, a ring of past
+# nodes.
 COVARIANCE = STATES
-"""The memory of a filter, float64: state, covariance (81, row by row), then"""
 (
     TIME, LAST_STAMP, NEWEST, NODES, FIX_NIS, READING_NIS, READINGS, FIXES_IN_A_ROW, FIX_AGE,
     FIXES_USED, FIXES_GATED, FIXES_LATE, FIXES_DUPLICATE, FIXES_NOT_FINITE, SPEED_GATED,
     YAW_RATE_GATED, HEADING_GATED, SPEED_IN_A_ROW, YAW_RATE_IN_A_ROW, HEADING_IN_A_ROW,
 ) = range(COVARIANCE + 81, COVARIANCE + 101)  # fmt: skip
 FILTER = COVARIANCE + 101
-"""from here on the nodes of the past, a ring: see NODE_*."""
+"""First entry of the ring of nodes."""
 
+# A node: its time, the step that led to it and the inputs in that step, readings (NaN: none),
+# state and covariance.
 NODE_TIME, NODE_STEP, NODE_A, NODE_DELTA = 0, 1, 2, 3
 NODE_SPEED, NODE_YAW_RATE, NODE_HEADING, NODE_FIX_X, NODE_FIX_Y, NODE_STATE = 4, 5, 6, 7, 8, 9
 NODE = NODE_STATE + STATES + 81
-"""A node: its time, the step that led to it and the inputs in it, readings (NaN: none), result."""
+"""Length of a node."""
 
-# What a filter is told, (SETTINGS,) float64: variances of the readings,
+# Settings of a filter, (SETTINGS,) float64: variances of the readings,
 POSITION_VARIANCE, HEADING_VARIANCE, YAW_RATE_VARIANCE, SPEED_VARIANCE = range(4)
 # densities of the process noise, per second,
 VX_DENSITY, VY_DENSITY, PSI_DENSITY, R_DENSITY, POSITION_DENSITY = 4, 5, 6, 7, 8
 GYRO_DENSITY, HEADING_BIAS_DENSITY, OFFSET_DENSITY = 9, 10, 11
 # gates on the NIS of a fix (2 degrees of freedom) and of a reading (1), rejections in a row after
-# which a reading is believed, the step of the prediction (s), and the vehicle's 7 parameters.
+# which a reading is used nevertheless, the prediction's step (s), the vehicle's 7 parameters.
 FIX_GATE, READING_GATE, MOST_IN_A_ROW, SUBSTEP, PARAMETERS = 12, 13, 14, 15, 16
 SETTINGS = PARAMETERS + 7
 
 USED, GATED, LATE, DUPLICATE, NOT_FINITE = range(5)
 FIX_RESULTS = ("used", "gated", "late", "duplicate", "not finite")
-"""What came of a fix, by code."""
+"""Outcomes of a fix, by code."""
 
 WORK = 2 * 81
-"""Size of the working space."""
+"""Size of the scratch array."""
 
-SPREAD_STEP = 0.35
-"""Largest product of step and poles where derivatives are taken: four digits of them."""
-NUDGES = (1e-4, 1e-4, 1e-5, 1e-6)
-"""Steps of the derivatives by vx, vy, r (m/s, m/s, rad/s) and delta (rad)."""
+JACOBIAN_STEP = 0.35
+"""Largest product of step and poles for the Jacobian: it gives four digits of its entries."""
+DIFFERENCES = (1e-4, 1e-4, 1e-5, 1e-6)
+"""Steps of the finite differences in vx, vy, r (m/s, m/s, rad/s) and delta (rad)."""
 
 
 @compiled_internal
-def spread(m: Array, f: Array, fp: Array) -> None:
-    """Covariance P = F P F' with F = `f` (81,), P in the filter's memory; `fp` (81,) is scratch."""
-    # The three biases stay: their rows of F are those of the identity.
+def propagate_covariance(m: Array, f: Array, fp: Array) -> None:
+    """Replace the filter's covariance P by F P F' with F = `f` (81,); `fp` (81,) is scratch."""
+    # The biases stay: their three rows of F are those of the identity.
     for i in range(6):
         for j in range(STATES):
             total = 0.0
@@ -92,10 +95,10 @@ def spread(m: Array, f: Array, fp: Array) -> None:
 
 @compiled_internal
 def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array) -> None:
-    """Predict state and covariance of a filter's memory by dt seconds, inputs held.
+    """Predict state and covariance dt seconds ahead, inputs held.
 
-    The transition is the derivative of the integrated field itself, by differences, so nothing
-    about it goes out of step with the model and stiff tyres at low speed do no harm.
+    The transition matrix is computed by finite differences of the integrated field itself: it
+    always fits the model, and stiff tyres at low speed do no harm.
     """
     s = settings
     p0, p1, p2, p3, p4, p5, p6 = (
@@ -106,15 +109,14 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
     h = dt / substeps
     vx, vy, psi, r = m[VX], m[VY], m[PSI], m[YAW_RATE]
     wheels = delta + m[STEERING_OFFSET]
-    # In the frame of the step's start, whose heading only turns the result.
+    # In the frame of the vehicle at the start: its heading only turns the result.
     nx, ny, turn, nr, ahead, aside = integrate(
         vx, vy, 0.0, r, 0.0, 0.0, a, wheels, p0, p1, p2, p3, p4, p5, p6, h, substeps
     )
-    # How things spread needs fewer steps: as many as resolve the lateral poles, whose sum bounds
-    # them.
+    # The Jacobian needs fewer steps, enough to resolve the lateral poles; their sum bounds each.
     q = compiled_inverse_speed(vx)
     poles = q * ((p4 + p5) / p0 + (p4 * p2 * p2 + p5 * p3 * p3) / p1)
-    few = min(max(math.ceil(poles * dt / SPREAD_STEP), 1), substeps)
+    few = min(max(math.ceil(poles * dt / JACOBIAN_STEP), 1), substeps)
     h = dt / few
     bx, by, bent, br, along, across = integrate(
         vx, vy, 0.0, r, 0.0, 0.0, a, wheels, p0, p1, p2, p3, p4, p5, p6, h, few
@@ -126,7 +128,7 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
     for k in range(STATES):
         f[k * STATES + k] = 1.0
     for k in range(4):
-        step = NUDGES[k]
+        step = DIFFERENCES[k]
         dvx, dvy, dturn, dr, dahead, daside = integrate(
             vx + (step if k == 0 else 0.0), vy + (step if k == 1 else 0.0), 0.0,
             r + (step if k == 2 else 0.0), 0.0, 0.0, a, wheels + (step if k == 3 else 0.0),
@@ -147,7 +149,7 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
     m[PSI] = psi + turn
     m[X] += dx
     m[Y] += dy
-    spread(m, f, work[81:162])
+    propagate_covariance(m, f, work[81:162])
     d = COVARIANCE
     m[d] += s[VX_DENSITY] * dt
     m[d + 10 * VY] += s[VY_DENSITY] * dt
@@ -161,12 +163,12 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
 
 
 @compiled_internal
-def take_in(
+def update(
     m: Array, first: int, second: int, innovation: Any, variance: Any, gate: Any, work: Array
 ) -> Any:
-    """Take in one number that is state `first` plus state `second` (-1: none) plus noise.
+    """Update the filter with a measurement of state `first` plus state `second` (-1: none).
 
-    Returns its NIS; one beyond `gate` changes nothing.
+    Returns the NIS; a measurement beyond `gate` changes nothing.
     """
     gain = work[:STATES]
     for i in range(STATES):
@@ -183,7 +185,7 @@ def take_in(
         share = gain[i] / total
         m[i] += share * innovation
         for j in range(i + 1):
-            # Symmetric in every digit, and so it stays.
+            # Both halves get the same number: the covariance stays exactly symmetric.
             change = m[COVARIANCE + i * STATES + j] - share * gain[j]
             m[COVARIANCE + i * STATES + j] = change
             m[COVARIANCE + j * STATES + i] = change
@@ -191,20 +193,21 @@ def take_in(
 
 
 @compiled_internal
-def read(
+def take_reading(
     m: Array, first: int, second: int, value: Any, variance: Any, row: int, gated: int,
     settings: Array, work: Array,
 ) -> None:  # fmt: skip
-    """Take in one reading, NaN for none, and count.
+    """Update the filter with one reading, NaN for none, and count the outcome.
 
-    One that has been refused long enough is believed: then the filter is wrong, not the sensor.
+    After enough rejections in a row a reading is used nevertheless: the filter is wrong, not the
+    sensor.
     """
     if not math.isfinite(value):
         return
     innovation = value - m[first] - (m[second] if second >= 0 else 0.0)
     if first == PSI:
         innovation = wrap(innovation)
-    nis = take_in(m, first, second, innovation, variance, settings[READING_GATE], work)
+    nis = update(m, first, second, innovation, variance, settings[READING_GATE], work)
     if nis <= settings[READING_GATE]:
         m[READING_NIS] += nis
         m[READINGS] += 1.0
@@ -215,12 +218,12 @@ def read(
     if m[row] >= settings[MOST_IN_A_ROW]:
         m[row] = 0.0
         inflate(m, first if second < 0 else second, innovation)
-        take_in(m, first, second, innovation, variance, math.inf, work)
+        update(m, first, second, innovation, variance, math.inf, work)
 
 
 @compiled_internal
 def inflate(m: Array, state: int, innovation: Any) -> None:
-    """Own that a state may be as far off as an innovation says."""
+    """Inflate the variance of a state to match a large innovation."""
     m[COVARIANCE + 10 * state] += innovation * innovation
 
 
@@ -228,49 +231,50 @@ def inflate(m: Array, state: int, innovation: Any) -> None:
 def take_readings(
     m: Array, speed: Any, yaw_rate: Any, heading: Any, settings: Array, work: Array
 ) -> None:
-    """Take in wheel speed (m/s), yaw rate (rad/s) and heading (rad), NaN for none."""
+    """Update the filter with wheel speed (m/s), yaw rate (rad/s) and heading (rad); NaN: none."""
     s = settings
     m[READING_NIS] = m[READINGS] = 0.0
-    read(m, VX, -1, speed, s[SPEED_VARIANCE], SPEED_IN_A_ROW, SPEED_GATED, s, work)
-    read(
+    take_reading(m, VX, -1, speed, s[SPEED_VARIANCE], SPEED_IN_A_ROW, SPEED_GATED, s, work)
+    take_reading(
         m, YAW_RATE, GYRO_BIAS, yaw_rate, s[YAW_RATE_VARIANCE], YAW_RATE_IN_A_ROW, YAW_RATE_GATED,
         s, work,
     )  # fmt: skip
-    read(m, PSI, HEADING_BIAS, heading, s[HEADING_VARIANCE], HEADING_IN_A_ROW, HEADING_GATED, s,
-         work)  # fmt: skip
+    take_reading(
+        m, PSI, HEADING_BIAS, heading, s[HEADING_VARIANCE], HEADING_IN_A_ROW, HEADING_GATED, s, work
+    )
 
 
 @compiled_internal
 def take_position(m: Array, x: Any, y: Any, gate: Any, settings: Array, work: Array) -> Any:
-    """Take in a position; returns its NIS, and one beyond `gate` changes nothing."""
+    """Update the filter with a position; return its NIS. One beyond `gate` changes nothing."""
     variance, d = settings[POSITION_VARIANCE], COVARIANCE
     ex, ey = x - m[X], y - m[Y]
     sxx, syy = m[d + 10 * X] + variance, m[d + 10 * Y] + variance
     sxy = m[d + X * STATES + Y]
     nis = (ex * ex * syy - 2.0 * ex * ey * sxy + ey * ey * sxx) / (sxx * syy - sxy * sxy)
     if nis <= gate:
-        take_in(m, X, -1, ex, variance, math.inf, work)
-        take_in(m, Y, -1, y - m[Y], variance, math.inf, work)
+        update(m, X, -1, ex, variance, math.inf, work)
+        update(m, Y, -1, y - m[Y], variance, math.inf, work)
     return nis
 
 
 @compiled_internal
-def keep(m: Array, nodes: Array, k: int) -> None:
-    """Write state and covariance into node k."""
+def store_node(m: Array, nodes: Array, k: int) -> None:
+    """Store state and covariance in node k."""
     for j in range(STATES + 81):
         nodes[k * NODE + NODE_STATE + j] = m[j]
 
 
 @compiled_internal
 def correlate(m: Array, state: int, bias: int) -> None:
-    """Say that a state was read by a sensor whose bias is `bias`: their errors are opposite."""
+    """Correlate the errors of a measured state and of its sensor's bias: they are opposite."""
     variance = m[COVARIANCE + 10 * bias]
     m[COVARIANCE + state * STATES + bias] = m[COVARIANCE + bias * STATES + state] = -variance
 
 
 @compiled
 def begin_filter(m: Array, time: Any) -> None:
-    """Begin at a time (s), state and covariance being set; the past is one node."""
+    """Begin at a time (s) from the state and covariance in `m`, with one node."""
     for j in range(TIME, m.shape[0]):
         m[j] = 0.0
     m[TIME], m[LAST_STAMP], m[NODES] = time, -math.inf, 1.0
@@ -279,7 +283,7 @@ def begin_filter(m: Array, time: Any) -> None:
     nodes[NODE_TIME] = time
     for j in range(NODE_SPEED, NODE_STATE):
         nodes[j] = math.nan
-    keep(m, nodes, 0)
+    store_node(m, nodes, 0)
 
 
 @compiled
@@ -287,30 +291,30 @@ def advance_filter(
     m: Array, time: Any, a: Any, delta: Any, speed: Any, yaw_rate: Any, heading: Any,
     settings: Array, work: Array,
 ) -> None:  # fmt: skip
-    """Predict to `time` under the mean inputs since the last call, and take in the readings."""
+    """Predict to `time` under the mean inputs since the last call, and update with readings."""
     dt = time - m[TIME]
     predict(m, a, delta, dt, settings, work)
     take_readings(m, speed, yaw_rate, heading, settings, work)
     m[TIME] = time
     m[FIX_AGE] += dt
     nodes = m[FILTER:]
-    room = nodes.shape[0] // NODE
-    newest = (int(m[NEWEST]) + 1) % room
+    capacity = nodes.shape[0] // NODE
+    newest = (int(m[NEWEST]) + 1) % capacity
     m[NEWEST] = newest
-    m[NODES] = min(m[NODES] + 1.0, float(room))
+    m[NODES] = min(m[NODES] + 1.0, float(capacity))
     node = nodes[newest * NODE : (newest + 1) * NODE]
     node[NODE_TIME], node[NODE_STEP], node[NODE_A], node[NODE_DELTA] = time, dt, a, delta
     node[NODE_SPEED], node[NODE_YAW_RATE], node[NODE_HEADING] = speed, yaw_rate, heading
     node[NODE_FIX_X] = node[NODE_FIX_Y] = math.nan
-    keep(m, nodes, newest)
+    store_node(m, nodes, newest)
 
 
 @compiled
 def take_fix(m: Array, stamp: Any, x: Any, y: Any, settings: Array, work: Array) -> int:
-    """Take in a fix of the position at `stamp` (s); returns what came of it, see FIX_RESULTS.
+    """Update the filter with a fix of the position at `stamp` (s); return a code of FIX_RESULTS.
 
-    It is moved to the nearest node's time by the velocity there, and what followed that node is
-    computed anew. A fix between two nodes has its own if it is no further than half a step away.
+    The fix is moved to the time of the nearest node by the velocity there, and the nodes after that
+    one are computed anew. The nearest node is at most half a step away.
     """
     if not math.isfinite(stamp + x + y):
         m[FIXES_NOT_FINITE] += 1.0
@@ -319,17 +323,17 @@ def take_fix(m: Array, stamp: Any, x: Any, y: Any, settings: Array, work: Array)
         m[FIXES_DUPLICATE] += 1.0
         return DUPLICATE
     nodes = m[FILTER:]
-    room, count = nodes.shape[0] // NODE, int(m[NODES])
+    capacity, count = nodes.shape[0] // NODE, int(m[NODES])
     back = 0
     while back + 1 < count:
-        here = nodes[((int(m[NEWEST]) - back + room) % room) * NODE :]
+        here = nodes[((int(m[NEWEST]) - back + capacity) % capacity) * NODE :]
         if stamp >= here[NODE_TIME] - 0.5 * here[NODE_STEP]:
             break
         back += 1
-    k = (int(m[NEWEST]) - back + room) % room
+    k = (int(m[NEWEST]) - back + capacity) % capacity
     node = nodes[k * NODE : (k + 1) * NODE]
     early = node[NODE_TIME] - stamp
-    # The oldest node has no readings before it that could tell where the vehicle was.
+    # Before the oldest node the filter knows nothing of the vehicle.
     late = early > max(0.5 * node[NODE_STEP], 1e-6) or stamp < m[LAST_STAMP]
     if late or math.isfinite(node[NODE_FIX_X]):
         m[FIXES_LATE] += 1.0
@@ -360,27 +364,27 @@ def take_fix(m: Array, stamp: Any, x: Any, y: Any, settings: Array, work: Array)
     m[FIXES_IN_A_ROW] = 0.0
     m[FIX_AGE] = m[TIME] - stamp
     node[NODE_FIX_X], node[NODE_FIX_Y] = x, y
-    keep(m, nodes, k)
+    store_node(m, nodes, k)
     replay(m, nodes, back, settings, work)
     return GATED if gated else USED
 
 
 @compiled_internal
 def replay(m: Array, nodes: Array, back: int, settings: Array, work: Array) -> None:
-    """Compute the last `back` nodes anew from the state in `m`; counts stay what they were."""
-    room = nodes.shape[0] // NODE
+    """Compute the last `back` nodes anew from the state in `m`; the counters do not change."""
+    capacity = nodes.shape[0] // NODE
     counts = (
         m[SPEED_GATED], m[YAW_RATE_GATED], m[HEADING_GATED], m[SPEED_IN_A_ROW],
         m[YAW_RATE_IN_A_ROW], m[HEADING_IN_A_ROW],
     )  # fmt: skip
     for left in range(back - 1, -1, -1):
-        k = (int(m[NEWEST]) - left + room) % room
+        k = (int(m[NEWEST]) - left + capacity) % capacity
         node = nodes[k * NODE : (k + 1) * NODE]
         predict(m, node[NODE_A], node[NODE_DELTA], node[NODE_STEP], settings, work)
         take_readings(m, node[NODE_SPEED], node[NODE_YAW_RATE], node[NODE_HEADING], settings, work)
         if math.isfinite(node[NODE_FIX_X]):
             take_position(m, node[NODE_FIX_X], node[NODE_FIX_Y], settings[FIX_GATE], settings, work)
-        keep(m, nodes, k)
+        store_node(m, nodes, k)
     (
         m[SPEED_GATED], m[YAW_RATE_GATED], m[HEADING_GATED], m[SPEED_IN_A_ROW],
         m[YAW_RATE_IN_A_ROW], m[HEADING_IN_A_ROW],
@@ -389,13 +393,13 @@ def replay(m: Array, nodes: Array, back: int, settings: Array, work: Array) -> N
 
 @compiled_internal
 def position_deviation(m: Array) -> Any:
-    """Standard deviation of the position in its worst direction, m."""
+    """Return the standard deviation of the position in its worst direction, m."""
     d = COVARIANCE
     xx, yy, xy = m[d + 10 * X], m[d + 10 * Y], m[d + X * STATES + Y]
     return math.sqrt(0.5 * (xx + yy) + math.sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy))
 
 
 @compiled
-def deviation_of(memory: Array, start: int) -> Any:
-    """`position_deviation` of the filter that begins at `start` in a memory."""
-    return position_deviation(memory[start:])
+def deviation_of(m: Array) -> Any:
+    """`position_deviation`, for calls from Python."""
+    return position_deviation(m)

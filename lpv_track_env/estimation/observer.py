@@ -1,4 +1,4 @@
-"""Observations of a path from estimated states: for a vehicle's own computer, and for logs."""
+"""Observations of a path from estimated states, for the computer of a vehicle and for logs."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,14 +10,14 @@ from trajectories.projection import SEARCH_WINDOW, tightest_turn
 
 
 class PathObserver:
-    """Makes of estimated states the observations that the environments would give of them.
+    """Compute the observations that the environments would return for estimated states.
 
     Parameters
     ----------
     path
-        The reference; its speed is what the preview shows.
+        The reference; the preview shows its speed.
     layout
-        The observation's layout: that of the agent it is for.
+        Layout of the observation, the same as the agent's.
 
     Examples
     --------
@@ -37,7 +37,7 @@ class PathObserver:
         self._constants[kernels.PREVIEW_PERIOD] = layout.preview_period
 
     def begin(self, state: ArrayLike, near: float | None = None) -> None:
-        """Find the place on the path: the foot point nearest to a state (6,), or to `near` (m)."""
+        """Begin at the foot point nearest to a state (6,), or to the arc length `near` (m)."""
         values = np.asarray(state, dtype=np.float64)
         x, y = float(values[4]), float(values[5])
         arc = self.path.project(x, y, near=near).arc_length
@@ -46,28 +46,30 @@ class PathObserver:
     def observe(
         self, state: ArrayLike, acceleration: float, steering_angle: float
     ) -> NDArray[np.float32]:
-        """Observation (size,) of an estimated state [vx, vy, psi, r, X, Y] and the actuators.
+        """Return the observation (size,) of an estimated state (6,) and the actuators.
 
-        The foot point is searched near the last one, so on the local branch of the path.
+        The foot point is searched near the last one, hence on the same branch of the path.
         """
         self._record[:6] = state
         self._record[kernels.ACCELERATION] = acceleration
         self._record[kernels.STEERING] = steering_angle
         window = min(SEARCH_WINDOW, self.path.length)
-        kernels.look(self._record, self._constants, self.path.table, self._observation, 0.0, window)
+        kernels.locate_and_observe(
+            self._record, self._constants, self.path.table, self._observation, 0.0, window
+        )
         return self._observation.copy()
 
     @property
     def arc_length(self) -> float:
-        """Of the last foot point, m; on a closed path it runs on over laps."""
+        """Arc length of the last foot point, m; on a closed path it increases over laps."""
         return float(self._record[kernels.ARC_LENGTH])
 
     @property
     def lateral_error(self) -> float:
-        """Of the last state, m, left positive."""
+        """Lateral error of the last state, m, left positive."""
         return float(self._record[kernels.LATERAL_ERROR])
 
     @property
     def heading_error(self) -> float:
-        """Of the last state, rad."""
+        """Heading error of the last state, rad."""
         return float(self._record[kernels.HEADING_ERROR])

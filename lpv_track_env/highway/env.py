@@ -10,16 +10,14 @@ from gymnasium import spaces
 from highway_env.road.road import RoadNetwork
 from numpy.typing import NDArray
 
-from lpv_track_env import kernels, plants
+from lpv_track_env import kernels
 from lpv_track_env.bicycle import VX
-from lpv_track_env.conditions import Conditions
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.highway import scenes
 from lpv_track_env.highway.cruise import CruiseControl
 from lpv_track_env.highway.traffic import EgoVehicle, TrafficReference, others_on
-from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import Task
-from lpv_track_env.validation import check_action
+from lpv_track_env.validation import check_action, forwards_arguments
 from lpv_track_env.vehicle import VehicleParameters
 from lpv_track_env.vehicle import load as load_vehicle
 from trajectories.naming import choose
@@ -112,13 +110,12 @@ class HighwayTrackEnv(PathTrackingEnv):
     v0: first version.
     """
 
+    @forwards_arguments(PathTrackingEnv, "trajectory", "speed_mode", "fixed_speed", "random_start")
     def __init__(
         self,
+        settings: dict[str, Any],
         scene: str | scenes.Scene | RoadNetwork = "racetrack",
         vehicle: str | Path | VehicleParameters = "m2-minibus",
-        conditions: str | Conditions | dict[str, Any] = "simulation",
-        control_period: float = 0.05,
-        render_mode: str | None = None,
         *,
         route: Sequence[str] | None = None,
         surroundings: str | Mapping[str, Any] | None = "lidar",
@@ -127,14 +124,6 @@ class HighwayTrackEnv(PathTrackingEnv):
         cruise: CruiseControl | None = CruiseControl(),  # noqa: B008  frozen
         speed_limits: SpeedLimits | None = None,
         laps: int = 1,
-        preview_steps: int = 20,
-        preview_period: float | None = None,
-        reward_weights: RewardWeights | None = None,
-        max_lateral_error: float = 5.0,
-        time_limit: float | None = None,
-        initial_error_range: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        plant: str | plants.Factory = plants.BICYCLE,
-        render_colour: str = "speed",
     ) -> None:
         self.scene = scenes.load(scene, route)
         if laps < 1 or (laps > 1 and not self.scene.closed):
@@ -149,14 +138,8 @@ class HighwayTrackEnv(PathTrackingEnv):
         self.highway = self.scene.make(other_vehicles, config or SURROUNDINGS["lidar"])
         self._surrounded = config is not None
         self._ego: EgoVehicle | None = None
-        super().__init__(
-            scenes.path_of(self.scene, 0, self.speed_limits), stoppable(vehicle), "variable", None,
-            conditions, control_period, render_mode,
-            preview_steps=preview_steps, preview_period=preview_period,
-            reward_weights=reward_weights, max_lateral_error=max_lateral_error,
-            time_limit=time_limit, initial_error_range=initial_error_range, plant=plant,
-            render_colour=render_colour,
-        )  # fmt: skip
+        path = scenes.path_of(self.scene, 0, self.speed_limits)
+        super().__init__(path, stoppable(vehicle), **settings)
         self.observation_space = self._space(self.observation_space)
 
     def _space(self, tracking: spaces.Space[Any]) -> spaces.Space[Any]:

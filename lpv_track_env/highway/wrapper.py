@@ -187,7 +187,7 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         record[kernels.ACCELERATION] = float(car.action["acceleration"])
         record[kernels.STEERING] = steering
         window = min(max(SEARCH_WINDOW, 1.5 * abs(ahead)), self.path.length)
-        kernels.look(
+        kernels.locate_and_observe(
             record, self._constants, self._reference.table, self._observation, ahead, window
         )
         return self._observation.copy()

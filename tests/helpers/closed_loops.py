@@ -48,7 +48,7 @@ def busy(env: PathTrackingVectorEnv) -> bool:
     if (given := env.condition_arrays) is None:
         return False
     now = env.records[0, k.STEPS] * env.single.control_period
-    return bool(given[0][0, layout.FREE_AT] > now + layout.INSTANT)
+    return bool(given[0][0, layout.FREE_AT] > now + layout.TIME_TOLERANCE)
 
 
 class InTurns:

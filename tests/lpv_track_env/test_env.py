@@ -20,9 +20,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import trajectories
-from lpv_track_env import PATH_TRACKING, kernels
+from lpv_track_env import HIGHWAY_TRACK, PATH_TRACKING, WEIGHT_TUNING, kernels
 from lpv_track_env.env import PathTrackingEnv
+from lpv_track_env.highway.env import HighwayTrackEnv
 from lpv_track_env.reward import TERMS, RewardWeights
+from lpv_track_env.vector_env import PathTrackingVectorEnv
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES
 from trajectories import shapes
 from trajectories.catalog import SHAPE_LIMITS
@@ -160,6 +162,43 @@ def test_documented_arguments_are_the_arguments() -> None:
                  "max_lateral_error", "time_limit"):  # fmt: skip
         assert name in section
         assert name in inspect.signature(PathTrackingEnv).parameters
+
+
+@pytest.mark.parametrize(
+    ("name", "argument", "nearest"),
+    [
+        (PATH_TRACKING, "contditions", "conditions"),
+        (HIGHWAY_TRACK, "sceen", "scene"),
+        (HIGHWAY_TRACK, "preview_stps", "preview_steps"),
+        (HIGHWAY_TRACK, "speed_mode", "speed_limits"),
+        (WEIGHT_TUNING, "choise", "choice"),
+        (WEIGHT_TUNING, "plant", "plant"),
+    ],
+)
+def test_an_unknown_argument_is_refused_with_the_nearest(
+    name: str, argument: str, nearest: str
+) -> None:
+    expected = rf"unknown argument '{argument}'; known: .*"
+    if argument != nearest:
+        expected += rf"\(nearest: {nearest}\)"
+    with pytest.raises(TypeError, match=expected):
+        gymnasium.make(name, **{argument: 1})
+    if name != HIGHWAY_TRACK:
+        with pytest.raises(TypeError, match=expected):
+            gymnasium.make_vec(
+                name, num_envs=2, vectorization_mode="vector_entry_point", **{argument: 1}
+            )
+
+
+@pytest.mark.parametrize("kind", [PathTrackingVectorEnv, HighwayTrackEnv])
+def test_environments_around_it_have_its_arguments(kind: type) -> None:
+    own, tracking = (
+        inspect.signature(kind).parameters,
+        inspect.signature(PathTrackingEnv).parameters,
+    )
+    for name in set(own) & set(tracking):
+        assert own[name].default == tracking[name].default
+    assert {"conditions", "control_period", "preview_steps", "time_limit"} <= set(own)
 
 
 # Determinism ---------------------------------------------------------------------------------

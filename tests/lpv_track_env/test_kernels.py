@@ -148,9 +148,11 @@ def record(**changes: float) -> np.ndarray:
     ],
 )
 def test_judgement(changes: dict[str, float], closed: float, wanted: str) -> None:
-    code = kernels.judge(record(**changes), constants(CLOSED=closed), True)
+    code = kernels.end_code(record(**changes), constants(CLOSED=closed), True)
     assert kernels.END_NAMES[code] == wanted
-    assert kernels.END_NAMES[kernels.judge(record(**changes), constants(), False)] == "non_finite"
+    assert (
+        kernels.END_NAMES[kernels.end_code(record(**changes), constants(), False)] == "non_finite"
+    )
 
 
 def test_layout_of_memory_and_constants() -> None:

@@ -11,7 +11,7 @@ from experiments import cli
 from experiments.commands import ablation
 from experiments.parallel import latency
 from experiments.run.computing import ARRANGEMENTS
-from lpv_track_env.conditions import DRAWN, REALTIME
+from lpv_track_env.conditions import DRAWN, IDEAL, REALTIME
 
 
 def test_every_disturbance_of_realtime_is_in_one_group() -> None:
@@ -19,7 +19,8 @@ def test_every_disturbance_of_realtime_is_in_one_group() -> None:
     assert len(grouped) == len(set(grouped))
     ideal = {"gnss_wander_time", "gnss_outlier_size", "gust_time", "side_area"}
     assert set(grouped) == set(DRAWN) - ideal
-    assert {name for name, _ in REALTIME.departures()} - set(grouped) == {"estimator"}
+    changed = {name for name, value in REALTIME.as_dict().items() if value != getattr(IDEAL, name)}
+    assert changed - set(grouped) == {"name", "estimator"}
 
 
 def test_ablation(

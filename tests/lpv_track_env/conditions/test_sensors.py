@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lpv_track_env.conditions import IDEAL, REALTIME, Conditions
-from lpv_track_env.sensors import Sensors
+from lpv_track_env.conditions.sensors import Sensors
 
 
 def test_perfect_sensors_tell_the_truth() -> None:
