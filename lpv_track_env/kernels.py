@@ -1,8 +1,8 @@
 """Compiled kernels of path tracking: actuators, integration, projection, reward, observation.
 
-`drive` and `start` work on the arrays of one episode; `advance` works on a single environment, whose
-arrays are packed in one. The other environments call the parts of `drive`. The constants are the
-indices of the arrays' entries.
+`drive` and `start` work on the arrays of one episode; `advance` works on a single environment,
+whose arrays are packed in one. The other environments call the parts of `drive`. The constants are
+the indices of the arrays' entries.
 """
 
 import math
