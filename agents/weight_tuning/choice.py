@@ -127,15 +127,15 @@ class WeightChoice:
         """Return the rules of switching for a control period (s), see `agents.nmpc.schedule`."""
         return rules_of(self.bands, 0.0, self.slew, period)
 
-    def as_packed(self) -> "PackedChoice":
-        """Return the arrays that `weights_for` takes."""
-        sets = [one.clipped().as_array() for one in self.catalogue]
-        return PackedChoice(
-            self.sets,
-            np.ascontiguousarray(self.matrix),
-            math.log(self.span),
-            np.array(sets).reshape(-1, 10),
-        )
+    @property
+    def log_span(self) -> float:
+        """Natural logarithm of the span."""
+        return math.log(self.span)
+
+    @property
+    def catalogue_sets(self) -> Array:
+        """Weights of the catalogue, (sets, 10)."""
+        return np.array([one.clipped().as_array() for one in self.catalogue]).reshape(-1, 10)
 
 
 def observation_space(choice: WeightChoice) -> spaces.Box:
@@ -182,16 +182,6 @@ def checked_actions(actions: Any, choice: WeightChoice, num_envs: int) -> Array:
         raise ValueError(f"the catalogue has sets 0 to {count - 1}, not {wrong}")
     chosen: Array = np.eye(count)[given]
     return chosen
-
-
-@dataclass(frozen=True, eq=False)
-class PackedChoice:
-    """A `WeightChoice` for compiled code."""
-
-    sets: Array
-    matrix: Array
-    log_span: float
-    catalogue: Array
 
 
 @compiled

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.learned.files import Layer
 from agents.learned.network import ACTIVATION, OUTPUTS, TANH, activate, dense, pack_layers
 from agents.weight_tuning.choice import WeightChoice, weights_for, weights_for_all
 from agents.weight_tuning.features import SCALES, fill_all, fill_features, size
@@ -13,7 +14,7 @@ from agents.weight_tuning.loop_memory import LoopMemory
 from trajectories.compilation import compiled_internal
 
 Array = NDArray[Any]
-Layers = tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
+Layers = tuple[Layer, ...]
 
 
 class PolicyArrays(NamedTuple):
@@ -64,17 +65,16 @@ class Decider:
         self.window = max(round(choice.window / period), 1)
         """Control periods between decisions."""
         activations = [*["tanh"] * (len(layers) - 1), "clip"] if layers else []
-        p = choice.as_packed()
         self.arrays = PolicyArrays(
-            *pack_layers(layers, activations), p.sets, p.matrix, p.log_span, p.catalogue, SCALES,
-            self.window,
+            *pack_layers(layers, activations), choice.sets, choice.matrix, choice.log_span,
+            choice.catalogue_sets, SCALES, self.window,
         )  # fmt: skip
         sizes = [size(len(choice.bands)), choice.entries, *(len(bias) for _, bias in layers)]
         self.widest = max(sizes)
         """Size of the largest layer, its inputs included."""
 
     def observe(self, observations: Array, memory: LoopMemory) -> NDArray[np.float32]:
-        """Features (n, size) of vehicles whose observations (n, entries) have been taken in."""
+        """Compute features (n, size) of vehicles after their observations (n, entries)."""
         p = self.arrays
         features = np.zeros((len(observations), size(len(self.choice.bands))), dtype=np.float32)
         fill_all(

@@ -25,9 +25,15 @@ STRAIGHT: dict[str, Any] = {"trajectory": "straight", "conditions": "simulation"
 
 def chosen(choice: WeightChoice, action: Any, band: int = 0) -> Array | None:
     """Set (10,) that is made of an action's numbers; None if it is refused."""
-    p, row = choice.as_packed(), np.full(10, -1.0)
+    row = np.full(10, -1.0)
     taken = weights_for(
-        np.asarray(action, dtype=np.float64), band, p.sets, p.matrix, p.log_span, p.catalogue, row
+        np.asarray(action, dtype=np.float64),
+        band,
+        choice.sets,
+        choice.matrix,
+        choice.log_span,
+        choice.catalogue_sets,
+        row,
     )
     if not taken:
         np.testing.assert_array_equal(row, np.full(10, -1.0))
