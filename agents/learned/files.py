@@ -4,6 +4,8 @@ This is the common core; `Kind` says how the files of one kind of policy differ.
 nothing: the files hold JSON and plain numbers, nothing is unpickled. NAME.json contains a digest of
 itself and one of the weights, so damaged or edited files are refused. The digests find accidents.
 They do not keep anybody from writing another policy, but the worst it can do is to drive badly.
+
+A file that cannot be used is a ValueError of one line that names the file and says what to do.
 """
 
 import hashlib
@@ -138,13 +140,7 @@ def write_files(
 
 
 def check_suffix(kind: Kind, file: Path) -> None:
-    """Check that a file is a NAME.json.
-
-    Raises
-    ------
-    ValueError
-        If it is not, saying which file to give instead.
-    """
+    """Check that a file is a NAME.json; the error says which file to give instead."""
     if file.suffix == ".json":
         return
     if file.suffix == ".safetensors":
@@ -160,11 +156,6 @@ def read_spec(kind: Kind, file: Path) -> Spec:
 
     No key is missing or unknown, at the top and in the objects of `OBJECTS` and `kind.objects`;
     the values are not checked.
-
-    Raises
-    ------
-    ValueError
-        In one line that names the file and what to do.
     """
     check_suffix(kind, file)
     content = _content(file, MOST_SPEC, kind.noun)
@@ -201,11 +192,6 @@ def read_tensors(kind: Kind, file: Path, spec: Spec) -> Tensors:
 
     They are the weights and biases, float32, of `kind.stages` and of 1 to `MOST_LAYERS` layers,
     named as by `layer_tensors`. The shapes are not checked.
-
-    Raises
-    ------
-    ValueError
-        In one line that names a file and what to do.
     """
     again = f"write the {kind.noun} again"
     name, size = spec["weights"]["file"], spec["weights"]["bytes"]
@@ -269,10 +255,7 @@ def layers_of(tensors: Tensors) -> tuple[Layer, ...]:
 def format_of(file: Path, noun: str) -> object:
     """Return the "format" in a JSON file; None if it has none or is not JSON.
 
-    Raises
-    ------
-    ValueError
-        In one line for a file that cannot be read or is too large; `noun` names the wanted file.
+    `noun` says in the error for a file that cannot be read what kind of file was wanted.
     """
     content = _content(file, MOST_SPEC, noun)
     try:
@@ -342,10 +325,7 @@ def _check_keys(kind: Kind, file: Path, where: str, found: Any, known: frozenset
 def plain_json(name: str, value: object) -> dict[str, Any]:
     """Copy a mapping through JSON: tuples become lists, keys become strings.
 
-    Raises
-    ------
-    ValueError
-        If it is not a mapping, or contains something that JSON does not have.
+    Anything that JSON does not have is a ValueError that begins with `name`.
     """
     if not isinstance(value, Mapping):
         raise ValueError(f"{name} must be a mapping, not {type(value).__name__}")  # noqa: TRY004
@@ -356,13 +336,7 @@ def plain_json(name: str, value: object) -> dict[str, Any]:
 
 
 def parse_json(text: str) -> dict[str, Any]:
-    """Parse a JSON object, refusing duplicate keys, NaN and infinity.
-
-    Raises
-    ------
-    ValueError
-        Saying what is wrong and where.
-    """
+    """Parse a JSON object; duplicate keys, NaN and infinity are a ValueError."""
     try:
         found = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse)
     except RecursionError:

@@ -1,4 +1,7 @@
-"""Learned policies that drive: their numbers, in SI units, and reading and writing them."""
+"""Learned policies that drive: their numbers, in SI units, and reading and writing them.
+
+Functions called `check...` raise a ValueError that names the value and what is wrong with it.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -117,7 +120,7 @@ class Policy:
     symmetric: bool = False
 
     def __post_init__(self) -> None:
-        check_name(self.algorithm)
+        checked_name(self.algorithm)
         choose("activation", self.activation, ACTIVATIONS)
         choose("squash", self.squash, SQUASHES)
         choose("origin", self.origin, ORIGINS)
@@ -228,13 +231,7 @@ def layout_spec(layout: ObservationLayout) -> Spec:
 
 
 def read_layout(file: Path, spec: Spec) -> ObservationLayout:
-    """Return the layout of a spec, if its entries are those of this version.
-
-    Raises
-    ------
-    ValueError
-        In one line that names the file, if they are not, or if it is not a layout.
-    """
+    """Return the layout of a spec; refuse one with other entries than this version's."""
     described = spec["layout"]
     steps, period = described["preview_steps"], described["preview_period"]
     if type(steps) is not int or type(period) is not float:
@@ -258,16 +255,11 @@ def read_layout(file: Path, spec: Spec) -> ObservationLayout:
     raise ValueError(f"{file}: made for an observation of other entries ({change}): retrain it")
 
 
-def check_name(algorithm: object) -> None:
-    """Check that a policy's `algorithm` is a name.
-
-    Raises
-    ------
-    ValueError
-        If it is not a string, or empty.
-    """
+def checked_name(algorithm: object) -> str:
+    """Check that a policy's `algorithm` is a string that is not empty."""
     if not isinstance(algorithm, str) or not algorithm.strip():
         raise ValueError(f"algorithm must be a name, not {algorithm!r}")
+    return algorithm
 
 
 def _check_symmetry(symmetric: object, centre: Array) -> None:
@@ -278,13 +270,7 @@ def _check_symmetry(symmetric: object, centre: Array) -> None:
 
 
 def checked_number(name: str, value: Any) -> float:
-    """Convert a finite number to a float.
-
-    Raises
-    ------
-    ValueError
-        For anything else, booleans included.
-    """
+    """Convert a finite number to a float; booleans are refused."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ValueError(f"{name} must be a number, not {value!r}")  # noqa: TRY004
     try:
@@ -323,10 +309,7 @@ def checked_layers(
 ) -> tuple[Layer, ...]:
     """Check that layers fit one another, `inputs` and `outputs`, and copy them to float32.
 
-    Raises
-    ------
-    ValueError
-        Naming the layer; `meaning` says in the message what the outputs are for.
+    `meaning` says in the message what the outputs are for.
     """
     if not 1 <= len(layers) <= MOST_LAYERS:
         raise ValueError(f"layers must be 1 to {MOST_LAYERS}, not {len(layers)}")
@@ -343,13 +326,7 @@ def checked_layers(
 
 
 def checked_layer(name: str, weight: ArrayLike, bias: ArrayLike, inputs: int) -> Layer:
-    """Check the weight (out, inputs) and bias (out,) of a layer, and copy them to float32.
-
-    Raises
-    ------
-    ValueError
-        Naming the layer, if they do not fit.
-    """
+    """Check the weight (out, inputs) and bias (out,) of a layer, and copy them to float32."""
     w, b = (
         _array(f"{name} {part}", value, np.float32)
         for part, value in (("weight", weight), ("bias", bias))

@@ -29,8 +29,8 @@ from agents.learned.files import (
     write_files,
 )
 from agents.learned.policy import (
-    check_name,
     checked_layers,
+    checked_name,
     checked_number,
     layout_spec,
     read_layout,
@@ -94,7 +94,7 @@ class WeightPolicy:
     training: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_name(self.algorithm)
+        checked_name(self.algorithm)
         inputs, outputs = size(len(self.choice.bands)), self.choice.entries
         layers = checked_layers(self.layers, inputs, outputs, "as the choice has entries")
         base = WeightSchedule.from_dict(plain_json("choice.base", self.choice.schedule.as_dict()))
