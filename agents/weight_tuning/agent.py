@@ -1,4 +1,4 @@
-"""The NMPC whose weights are chosen while it drives: `lpv-nmpc-tuned`."""
+"""`lpv-nmpc-tuned`: the NMPC with weights that are chosen while it drives."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -29,11 +29,11 @@ SHIPPED = {
     "paired": CHECKPOINTS / "lpv-nmpc-tuned-paired.json",
 }
 """Weights that come with this project, by the method of `lpv-track tune` that found them: the best
-fixed set, for whatever is seen, and a policy for the usual observations."""
+fixed set, for any observation layout, and a policy for the default one."""
 
 
 class TunedNmpc:
-    """`lpv-nmpc`, its weights chosen as it drives: by a weight policy, a schedule, or fixed ones.
+    """`lpv-nmpc` with weights from a weight policy, a schedule, or a fixed set.
 
     A policy decides once per window and at every change of band, from what the agent observes and
     does. Its actions are bit for bit those of `ClosedLoop.drive` with the same policy. Decisions
@@ -119,14 +119,14 @@ class TunedNmpc:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,  # noqa: ARG002  part of the protocol
     ) -> tuple[Action, LoopMemory]:
-        """Action (2,) for one observation (size,), or (n, 2) for a batch; and the memory.
+        """Return the action (2,) for one observation (size,), or (n, 2) for a batch; and memory.
 
         Raises
         ------
         ValueError
             If the observation does not have this agent's layout.
         """
-        with np.errstate(over="ignore"):  # what float32 cannot hold is not finite
+        with np.errstate(over="ignore"):  # becomes infinite, which is handled as such
             rows = observation_rows(observation, self.task.layout.size).astype(np.float32)
         n = len(rows)
         memory = self._memory if state is None else state

@@ -48,7 +48,7 @@ SLEW = 6.0
 
 @dataclass(frozen=True)
 class WeightChoice:
-    """Set of weights to choose from, meaning of an action, and time between decisions.
+    """Weights that may be chosen, the meaning of an action, and the time between decisions.
 
     Parameters
     ----------
@@ -139,13 +139,13 @@ class WeightChoice:
 
 
 def observation_space(choice: WeightChoice) -> spaces.Box:
-    """Space of the features of a choice."""
+    """Return the space of the features that a choice depends on."""
     shape = (size(len(choice.bands)),)
     return spaces.Box(-LIMIT, LIMIT, shape, dtype=np.float32)
 
 
 def action_space(choice: WeightChoice) -> spaces.Box | spaces.Discrete[np.int64]:
-    """Space of the actions of a choice."""
+    """Return the space of the actions of a choice."""
     if choice.catalogue:
         return spaces.Discrete(len(choice.catalogue))
     return spaces.Box(-1.0, 1.0, (choice.entries,), dtype=np.float32)
