@@ -28,55 +28,42 @@ class Published:
     segments: str
 
 
-def _published(
-    speed_kmh: float,
-    acceleration: float,
-    lateral: float,
-    length: float,
-    max_curvature: float,
-    total_curvature: float,
-    segments: str,
-) -> Published:
-    rows = PathStatistics(
-        speed_kmh * KMH, acceleration, lateral, length, max_curvature, total_curvature
-    )
-    return Published(rows, segments)
-
-
 PUBLISHED: dict[str, Published] = {
-    # kumar2025lpv, table of trajectories. Campus blocks, a long fast straight, sharp turns.
-    "T1": _published(
-        50.36, 1.32, 1.10, 783.51, 1.81, 42.57,
+    # kumar2025lpv, table of trajectories: largest speed, longitudinal and lateral acceleration
+    # (m/s^2), length (m), largest and total curvature (1/m).
+    # Campus blocks, a long fast straight, sharp turns.
+    "T1": Published(
+        PathStatistics(50.36 * KMH, 1.32, 1.10, 783.51, 1.81, 42.57),
         "S 45 | L 90 r11 | S 40 | R 90 r11 | S 215 | R 90 r13 | S 35 | R 45 r20 | S 25 | L 45 r20 "
         "| S 30 | L 90 r11 | S 45 | R 90 r11 | S 30 | L 70 r18 | S 35",
     ),
     # A quiet loop.
-    "T2": _published(
-        28.05, 2.01, 1.50, 513.17, 2.79, 24.49,
+    "T2": Published(
+        PathStatistics(28.05 * KMH, 2.01, 1.50, 513.17, 2.79, 24.49),
         "S 50 | R 90 r12 | S 60 | L 45 r30 | S 40 | L 90 r15 | S 60 | R 36 r40 | S 40 | R 90 r10 "
         "| S 60",
     ),
     # A chicane, a hairpin, sweepers.
-    "T3": _published(
-        31.01, 1.51, 1.89, 1033.47, 3.98, 44.35,
+    "T3": Published(
+        PathStatistics(31.01 * KMH, 1.51, 1.89, 1033.47, 3.98, 44.35),
         "S 90 | L 90 r15 | S 70 | R 60 r20 | S 30 | L 60 r20 | S 110 | L 160 r12 | S 120 "
         "| R 90 r25 | S 60 | R 90 r14 | S 90 | L 85 r22 | S 70",
     ),
     # A slow grid of right angles.
-    "T4": _published(
-        23.01, 2.00, 1.20, 500.00, 4.00, 44.00,
+    "T4": Published(
+        PathStatistics(23.01 * KMH, 2.00, 1.20, 500.00, 4.00, 44.00),
         "S 45 | L 90 r10 | S 18 | R 90 r10 | S 30 | R 90 r10 | S 50 | L 90 r12 | S 25 | L 90 r10 "
         "| S 30 | R 90 r11 | S 20 | R 90 r15 | S 40",
     ),
     # A test track with prolonged bends.
-    "T5": _published(
-        38.59, 1.85, 1.56, 2119.60, 4.00, 45.00,
+    "T5": Published(
+        PathStatistics(38.59 * KMH, 1.85, 1.56, 2119.60, 4.00, 45.00),
         "S 260 | L 190 r42 | S 180 | R 180 r38 | S 260 | R 75 r60 | S 130 | L 110 r30 | S 220 "
         "| R 90 r16 | S 240",
     ),
     # A ring road, prolonged bends at the lateral limit.
-    "T6": _published(
-        28.12, 1.86, 2.00, 1959.30, 2.00, 20.00,
+    "T6": Published(
+        PathStatistics(28.12 * KMH, 1.86, 2.00, 1959.30, 2.00, 20.00),
         "S 380 | L 110 r27 | S 420 | L 60 r120 | S 250 | R 70 r26 | S 420 | L 46.5 r30 | S 250",
     ),
 }  # fmt: skip

@@ -190,59 +190,29 @@ class _Announcement(event.Listener):
 
 
 class _Accelerator(event.Listener):
-    """Change something while numba compiles, from the outermost function's start to its end."""
+    """Shorten the time to compile, from the start of the outermost function to its end.
 
-    def __init__(self) -> None:
-        self.depth = 0
+    The garbage collector is off, which saves a tenth: the objects that numba builds survive, so it
+    would walk an ever larger heap and free little.
 
-    def begin(self) -> None:
-        """Make the change."""
-
-    def end(self) -> None:
-        """Undo the change."""
-
-    def on_start(self, event: event.Event) -> None:  # noqa: ARG002  part of the protocol
-        self.depth += 1
-        if self.depth == 1:
-            self.begin()
-
-    def on_end(self, event: event.Event) -> None:  # noqa: ARG002  part of the protocol
-        self.depth -= 1
-        if self.depth == 0:
-            self.end()
-
-
-class _NoGarbageCollection(_Accelerator):
-    """Keep the garbage collector off, which saves a tenth of the time to compile.
-
-    The objects that numba builds survive, so the collector would walk an ever larger heap and free
-    little.
-    """
-
-    def begin(self) -> None:
-        self.was_on = gc.isenabled()
-        gc.disable()
-
-    def end(self) -> None:
-        if self.was_on:
-            gc.enable()
-
-
-class _KnownArithmetic(_Accelerator):
-    """Remember the types that numba infers for operations on plain numbers.
-
-    For every product of two floats numba tries anew all that a product can mean (of strings, lists,
-    arrays, ...), which takes an eighth of the time to compile.
+    The types that numba infers for operations on plain numbers are remembered, which saves an
+    eighth: for every product of two floats numba would try anew all that a product can mean (of
+    strings, lists, arrays, ...).
     """
 
     def __init__(self) -> None:
-        super().__init__()
+        self.depth, self.collected = 0, False
         self.plain = BaseFunction.get_call_type
         self.known: dict[tuple[int, tuple[Any, ...]], Any] = {}
         # References to the functions in `known`, so that no other object gets their ids.
         self.functions: dict[int, Any] = {}
 
-    def begin(self) -> None:
+    def on_start(self, event: event.Event) -> None:  # noqa: ARG002  part of the protocol
+        self.depth += 1
+        if self.depth > 1:
+            return
+        self.collected = gc.isenabled()
+        gc.disable()
         known, functions, plain = self.known, self.functions, self.plain
 
         def get_call_type(function: Any, context: Any, args: Any, kws: Any) -> Any:
@@ -256,11 +226,16 @@ class _KnownArithmetic(_Accelerator):
 
         setattr(BaseFunction, "get_call_type", get_call_type)  # noqa: B010
 
-    def end(self) -> None:
+    def on_end(self, event: event.Event) -> None:  # noqa: ARG002  part of the protocol
+        self.depth -= 1
+        if self.depth > 0:
+            return
         setattr(BaseFunction, "get_call_type", self.plain)  # noqa: B010
         self.known.clear()
         self.functions.clear()
+        if self.collected:
+            gc.enable()
 
 
-for _listener in (_Announcement(), _NoGarbageCollection(), _KnownArithmetic()):
+for _listener in (_Announcement(), _Accelerator()):
     event.register("numba:compile", _listener)  # type: ignore[no-untyped-call]

@@ -76,7 +76,7 @@ def paper_field(x: Array, u: Array, p: VehicleParameters) -> tuple[Array, Array]
 
 
 def assert_close(actual: Array, wanted: Array, sizes: Array) -> None:
-    """Equal to 1e-9 of the terms summed: where they cancel, no more can be asked of floats."""
+    """Equal to 1e-9 of the summed terms: where they cancel, floats cannot be more accurate."""
     excess = np.abs(actual - wanted) / np.maximum(sizes, np.finfo(float).tiny)
     assert excess.max() <= 1e-9
 

@@ -1,4 +1,4 @@
-"""Plants that nobody here modelled: their motion, the environment around them, the bicycle's field.
+"""Plants of other authors: their motion, the environment around them, the bicycle's field.
 
 Here CommonRoad's single-track model is an independent implementation of the same physics.
 """
@@ -339,7 +339,7 @@ def test_nmpc_drives_every_plant(name: str) -> None:
 
 
 class SameBicycle:
-    """The kernels' bicycle as if it were somebody else's."""
+    """The kernels' bicycle as a plant."""
 
     def __init__(self, vehicle: VehicleParameters) -> None:
         self.vehicle = vehicle

@@ -538,7 +538,7 @@ def area(polygon: NDArray[np.float64]) -> float:
 
 
 def test_a_large_road_costs_nothing_out_of_sight() -> None:
-    """What is handed to pygame stays near the picture, however long the road is."""
+    """Polygons given to pygame stay near the picture, however long the road is."""
     view = View((0.0, 0.0), 20.0, (900.0, 456.0))
     low, high = view.window()
     road = np.array([(-1e5, -4.0), (1e5, -4.0), (1e5, 4.0), (-1e5, 4.0)])

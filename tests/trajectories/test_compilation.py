@@ -106,7 +106,7 @@ def first_of_sum(x: Any, y: Any) -> Any:
 
 
 def test_entry_point_is_the_compiled_function_for_these_types() -> None:
-    """Of each layout its own: the dispatch that it leaves out would have told them apart."""
+    """Each array layout has its own entry point: no dispatch tells layouts apart here."""
     row, column = np.arange(6.0), np.arange(6.0).reshape(3, 2)[1:, 1]
     for array, wanted in ((row, 2.5), (column, 5.5)):
         entry = entry_point(first_of_sum, array, 2.5)
@@ -167,7 +167,7 @@ def run(code: str, folder: Path, **environment: str) -> subprocess.CompletedProc
 
 
 def test_cache_is_used_and_never_stale(tmp_path: Path) -> None:
-    """A constant in an imported module: numba's own cache would go on with its old value."""
+    """A constant in an imported module changes: numba alone would use the cached old value."""
     (tmp_path / "constants.py").write_text("FACTOR = 2.0\n")
     (tmp_path / "model.py").write_text(
         "from constants import FACTOR\n"
@@ -189,7 +189,7 @@ def test_cache_is_used_and_never_stale(tmp_path: Path) -> None:
 
 
 def test_stamp_reaches_numbas_index() -> None:
-    """The digest hangs on a private attribute of numba: a release that renames it must be seen."""
+    """The digest uses a private attribute of numba: a release that renames it must be noticed."""
     index = compiled_sum._cache._cache_file  # type: ignore[attr-defined]
     stamp, digest = index._source_stamp
     assert digest == DIGEST
@@ -197,7 +197,7 @@ def test_stamp_reaches_numbas_index() -> None:
 
 
 def test_function_that_numba_cannot_cache_warns_and_works() -> None:
-    """Code without a file has no place for a cache: the same refusal as an unwritable folder."""
+    """Code without a file has no place for a cache: numba refuses it like an unwritable folder."""
     names: dict[str, Any] = {}
     exec("def triple(x):\n    return 3.0 * x\n", names)  # noqa: S102
     with pytest.warns(

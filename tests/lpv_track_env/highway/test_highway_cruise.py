@@ -1,4 +1,4 @@
-"""Adaptive cruise control: by hand, by highway-env's IDM, and by who must not be hit."""
+"""Adaptive cruise control against hand calculation and highway-env's IDM; no collisions."""
 
 from collections.abc import Sequence
 from types import SimpleNamespace
@@ -49,7 +49,7 @@ def test_at_its_own_gap_nothing_is_asked_for() -> None:
 @pytest.mark.parametrize("ahead", [14.0, 25.0, 60.0])
 @pytest.mark.parametrize("leads", [3.0, 6.0])
 def test_the_response_is_that_of_highway_envs_idm(speed: float, ahead: float, leads: float) -> None:
-    """Its acceleration less its free-road term; it measures gaps between centres."""
+    """highway-env's acceleration without its free-road term; it measures gaps between centres."""
     road = straight_road()
     own = IDMVehicle(road, [10.0, 0.0], 0.0, speed, target_speed=10.0)
     other = Vehicle(road, [10.0 + ahead, 0.0], 0.0, leads)
@@ -65,7 +65,7 @@ def test_the_response_is_that_of_highway_envs_idm(speed: float, ahead: float, le
 @given(speed=st.floats(0.0, 15.0), leads=st.floats(0.0, 15.0), spare=st.floats(0.5, 60.0))
 @settings(max_examples=150, deadline=None)
 def test_nobody_is_hit_who_could_be_braked_for(speed: float, leads: float, spare: float) -> None:
-    """From any gap that braking at the bound still covers, 20 s of the profile."""
+    """No collision in 20 s of the profile, from any gap that allows braking at the bound."""
     approach = max(speed - leads, 0.0)
     gap = approach**2 / (2.0 * CRUISE.max_deceleration) + 0.05 * approach + spare
     places, speeds = CRUISE.profile(0.0, speed, [Leader(gap, leads)], 0.05, 400)
@@ -85,7 +85,7 @@ def test_of_several_leaders_the_one_counts_that_asks_for_most() -> None:
 
 @pytest.mark.parametrize(("name", "s"), [("T2", 100.0), ("T2", 505.0), ("circle", 180.0)])
 def test_a_lowered_table_is_that_of_a_lowered_path(name: str, s: float) -> None:
-    """Speeds at most the path's, times as the path with these speeds has them."""
+    """Speeds are at most the path's, and times agree with the speeds."""
     path = trajectories.load(name)
     table = path.table.copy()
     at, speed = CRUISE.profile(s, 5.0, [Leader(15.0, 2.0)], 0.05, 60)
@@ -146,7 +146,7 @@ def test_who_is_in_the_way(x: float, y: float, heading: float, speed: float, cou
 
 
 def test_who_merges_gives_a_gap_to_keep() -> None:
-    """A lane that joins the path at 80 m, a vehicle on it 30 m before, as we are."""
+    """A lane joins the path at 80 m; a vehicle on it is 30 m before the merge, as the ego is."""
     network = RoadNetwork()
     network.add_lane("a", "b", StraightLane([0.0, 0.0], [80.0, 0.0]))
     network.add_lane("c", "b", StraightLane([58.8, 21.2], [80.0, 0.0]))
@@ -163,7 +163,7 @@ def test_who_merges_gives_a_gap_to_keep() -> None:
 
 
 def test_vehicles_are_foreseen_as_highway_env_foresees_them() -> None:
-    """Where its own prediction works: along a route over roads of one lane."""
+    """Compare with highway-env's prediction where it works: on roads with one lane."""
     network = RoadNetwork()
     network.add_lane("a", "b", StraightLane([0.0, 0.0], [50.0, 0.0]))
     network.add_lane("b", "c", StraightLane([50.0, 0.0], [80.0, 40.0]))

@@ -1,4 +1,4 @@
-"""`HighwayTrack-v0`: Gymnasium's and SB3's checks, who drives it, what traffic does to it."""
+"""`HighwayTrack-v0`: Gymnasium's and SB3's checks, agents that drive it, effects of traffic."""
 
 import copy
 import pickle
@@ -345,7 +345,7 @@ def test_without_highway_env_one_line_names_the_extra() -> None:
 @pytest.mark.parametrize("speed", [0.05, 0.2, 0.5])
 @pytest.mark.parametrize("name", ["lpv-nmpc", "lpv-nmpc-ipopt"])
 def test_the_nmpc_creeps_where_its_vehicle_may_stop(name: str, speed: float) -> None:
-    """Its model must be stable down there: with too long steps it drove off backwards."""
+    """The model must be stable at standstill: with longer steps the vehicle drove backwards."""
     car = alone().vehicle
     assert car.speed_range[0] == 0.0
     env = gymnasium.make(

@@ -1,4 +1,4 @@
-"""Paths from highway-env's lanes, judged by the lanes themselves."""
+"""Paths from highway-env's lanes, compared with the lanes themselves."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""Agents at the wheel of highway-env's own vehicle."""
+"""Agents that drive highway-env's own vehicle."""
 
 from typing import Any
 
@@ -59,7 +59,7 @@ def test_where_there_is_no_throttle_it_steers_at_the_speed_it_has() -> None:
 
 
 def test_the_state_is_the_vehicles_and_moves_as_it_says() -> None:
-    """What highway-env's vehicle does in a step is what the state's own rates say."""
+    """A step of highway-env's vehicle agrees with the rates in the state."""
     env = make(policy_frequency=30, other_vehicles=0)
     env.reset(seed=0)
     for _ in range(20):
