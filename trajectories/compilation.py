@@ -95,7 +95,8 @@ def _compile(function: Function, *sources: Path, **more: bool | str) -> Function
         return numba.njit(**options)(function)  # type: ignore[no-any-return]
     index = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if index is not None and hasattr(index, "_source_stamp"):
-        folders = dict.fromkeys((*_packages_below(function), *sources))
+        folder = Path(function.__code__.co_filename).parent
+        folders = dict.fromkeys((*_packages_for(folder), *sources))
         index._source_stamp = (index._source_stamp, source_digest(*folders))  # noqa: SLF001
     return dispatcher  # type: ignore[no-any-return]
 
@@ -142,13 +143,14 @@ def source_digest(*folders: Path) -> str:
     return digest.hexdigest()
 
 
-def _packages_below(function: Callable[..., Any]) -> list[Path]:
-    """Folders of the packages whose sources a compiled function may use, its own among them.
+@cache
+def _packages_for(folder: Path) -> list[Path]:
+    """Folders of the packages whose sources a compiled function of some folder may use.
 
     These are this package, every loaded package that has `COMPILED_LIBRARY = True` (compiled
-    functions and constants for packages above it), and the function's own.
+    functions and constants for the packages above it), and the function's own.
     """
-    own = Path(function.__code__.co_filename).parent
+    own = folder
     while (own.parent / "__init__.py").is_file():
         own = own.parent
     if own == HERE:

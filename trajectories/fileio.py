@@ -122,7 +122,7 @@ def write_atomically(file: Path, content: bytes) -> None:
     Raises
     ------
     OSError
-        If it cannot be written; what was there before is untouched, nothing is left beside it.
+        If the file cannot be written; the old file is unchanged, and no temporary file is left.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     temporary = file.with_name(f".{file.name}.{secrets.token_hex(4)}.tmp")

@@ -128,7 +128,7 @@ class HighwayTrackEnv(PathTrackingEnv):
         self.scene = scenes.load(scene, route)
         if laps < 1 or (laps > 1 and not self.scene.closed):
             raise ValueError(
-                f"laps must be at least 1, and 1 on a route that is no lap, not {laps}"
+                f"laps must be at least 1, and exactly 1 on an open route, not {laps}"
             )
         self.laps, self.cruise, self.flat = laps, cruise, flat
         self.speed_limits = speed_limits or SpeedLimits(
