@@ -127,9 +127,7 @@ class HighwayTrackEnv(PathTrackingEnv):
     ) -> None:
         self.scene = scenes.load(scene, route)
         if laps < 1 or (laps > 1 and not self.scene.closed):
-            raise ValueError(
-                f"laps must be at least 1, and exactly 1 on an open route, not {laps}"
-            )
+            raise ValueError(f"laps must be at least 1, and exactly 1 on an open route, not {laps}")
         self.laps, self.cruise, self.flat = laps, cruise, flat
         self.speed_limits = speed_limits or SpeedLimits(
             max_speed=self.scene.max_speed, max_lateral_acceleration=2.0, max_acceleration=1.5

@@ -280,7 +280,10 @@ def test_conditions_and_plants_are_path_trackings() -> None:
         ({"surroundings": "radar"}, "unknown surroundings 'radar'"),
         ({"scene": "roundabout", "other_vehicles": 3}, "own number of other vehicles"),
         ({"other_vehicles": -1}, "other_vehicles must be 0 or more"),
-        ({"scene": "roundabout", "laps": 2}, "laps must be at least 1, and 1 on a route"),
+        (
+            {"scene": "roundabout", "laps": 2},
+            "laps must be at least 1, and exactly 1 on an open route",
+        ),
         ({"scene": straight_network()}, "needs a route"),
         ({"scene": straight_network(), "route": ("a", "c")}, "no road from 'a' to 'c'"),
         ({"route": ("a", "c")}, "no road from 'a' to 'c'"),
