@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 
 EXAMPLE = "lpv-track train ppo --seed 0 --hours 0.1 --out results/ppo"
 
+PLAIN = (
+    "seed", "vehicle", "envs", "segment", "trajectories", "paths", "start", "device",
+    "control_period", "preview_steps", "preview_period",
+)  # fmt: skip
+"""Options that are settings as they were given."""
 REPEATED = (
     "vehicle", "conditions", "conditions_set", "trajectories", "paths", "envs", "segment",
     "start", "control_period", "preview_steps", "preview_period", "set", "reward", "device",
@@ -116,21 +121,10 @@ def settings_of(options: argparse.Namespace) -> "TrainingSettings":
     kinds = [{"name": name, **changes} if changes else name for name in options.conditions or ()]
     if changes and not kinds:
         raise ValueError("--conditions-set needs --conditions, which it changes")
-    given: dict[str, Any] = {
-        "steps": None if options.steps is None else whole_number(options.steps, "--steps"),
-        "seed": options.seed,
-        "vehicle": options.vehicle,
-        "conditions": kinds or None,
-        "envs": options.envs,
-        "segment": options.segment,
-        "trajectories": options.trajectories,
-        "paths": options.paths,
-        "start": options.start,
-        "device": options.device,
-        "control_period": options.control_period,
-        "preview_steps": options.preview_steps,
-        "preview_period": options.preview_period,
-    }
+    given: dict[str, Any] = {name: getattr(options, name) for name in PLAIN}
+    given["conditions"] = kinds or None
+    if options.steps is not None:
+        given["steps"] = whole_number(options.steps, "--steps")
     given = {key: value for key, value in given.items() if value is not None}
     hyperparameters = parse_settings(options.set)
     if options.fast:

@@ -87,8 +87,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
             progress.update(bar, completed=1, total=1)
 
         follow("trainings", run_trainings(study, options.workers))
-        follow("judging", run_evaluations(study, options.workers))
-        headroom, greedy = study_oracles(study, quick=options.quick, follow=follow)
+        follow("evaluations", run_evaluations(study, options.workers))
+        headroom, greedy = study_oracles(study, progress, quick=options.quick)
     report = study.folder / "report.html"
     summary = write_report(study, headroom, greedy, report)
     for line in summary["ladder"]:

@@ -8,12 +8,13 @@ window: it looks a few windows ahead on a copy of the drive, disturbances includ
 """
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.progress import Progress
 from scipy.stats import qmc
 
 import agents
@@ -44,12 +45,9 @@ BRANCHES, QUICK_BRANCHES = 12, 3
 KNOWN = (layout.GNSS_NOISE, layout.STEERING_LAG, layout.STEERING_DEAD_TIME)
 """Conditions that an oracle may know, each as high or low against its median."""
 
-Follow = Callable[[str, Iterator[tuple[int, int]]], None]
-"""Runs an iterator over (done, all), showing its progress under a name."""
-
 
 def study_oracles(
-    study: Study, *, quick: bool, follow: Follow
+    study: Study, progress: Progress, *, quick: bool
 ) -> tuple[list["Headroom"], float | None]:
     """Compute the headroom of a study's first set and the greedy oracle's score.
 
@@ -67,29 +65,20 @@ def study_oracles(
         and isinstance(result := load(study.training(rung.label, seed) / WEIGHTS), WeightSchedule)
     ]
     pool = pool_of(QUICK_POOL if quick else POOL, found)
-    scores: list[Array] = []
-    known: list[Array] = []
-
-    def pooled() -> Iterator[tuple[int, int]]:
-        for path_scores, path_known in scores_of_pool(given, pool):
-            scores.append(path_scores)
-            known.append(path_known)
-            yield len(scores), len(given.trajectories)
-
-    follow("oracle: every set on every drive", pooled())
-    table = np.stack(scores)
-    rows = headroom(table, np.stack(known))
-    greedy_scores: list[Array] = []
+    paths = len(given.trajectories)
+    driven = list(
+        progress.track(
+            scores_of_pool(given, pool), paths, description="oracle: every set on every drive"
+        )
+    )
+    table = np.stack([scores for scores, _ in driven])
+    rows = headroom(table, np.stack([known for _, known in driven]))
     # A few drives a path: each tries many sets in every window.
     few = replace(given, seeds=min(given.seeds, 2))
     some = pool[varied(table, QUICK_BRANCHES if quick else BRANCHES)]
-
-    def greedily() -> Iterator[tuple[int, int]]:
-        for path_scores in greedy(few, some):
-            greedy_scores.append(path_scores)
-            yield len(greedy_scores), len(given.trajectories)
-
-    follow("oracle: greedy, every window", greedily())
+    greedy_scores = list(
+        progress.track(greedy(few, some), paths, description="oracle: greedy, every window")
+    )
     best = table.mean(axis=(0, 2)).argmin()
     # The ratio to the best fixed set on the greedy oracle's few drives, scaled to all drives.
     share = np.mean(greedy_scores) / table[:, best, : few.seeds].mean()

@@ -19,7 +19,7 @@ paths.
 import json
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -41,8 +41,48 @@ Array = NDArray[Any]
 STATE, FORMAT = "search.json", "lpv-track-search/1"
 
 
-class Search(Tuner):
-    """Generations of points, scored on drives; the scores are the whole state."""
+class ReplayedTuner(Tuner):
+    """A tuning that is resumed by repeating it with the known scores of its candidates."""
+
+    @property
+    @abstractmethod
+    def state(self) -> dict[str, Any]:
+        """Scores and solves so far, in plain JSON."""
+
+    @abstractmethod
+    def replay(self, state: Mapping[str, Any]) -> None:
+        """Repeat the tuning with the scores of a state.
+
+        Raises
+        ------
+        ValueError, KeyError, TypeError
+            If the state does not fit.
+        """
+
+    def save(self, folder: Path) -> None:
+        """Write the state."""
+        content = json.dumps({"format": FORMAT, **self.state})
+        write_atomically(folder / STATE, content.encode())
+
+    def read_state(self, folder: Path) -> bool:
+        """Repeat the tuning with the scores that `save` wrote; False if there are none."""
+        file = folder / STATE
+        if not file.exists():
+            return False
+        try:
+            content = json.loads(file.read_text())
+            if content["format"] != FORMAT:
+                raise ValueError(f"its format is {content['format']!r}, not {FORMAT!r}")
+            self.replay(content)
+        except KeyError as error:
+            raise ValueError(unusable(file, f"no {error} in it")) from None
+        except (OSError, TypeError, AttributeError, ValueError, RecursionError) as error:
+            raise ValueError(unusable(file, str(error))) from None
+        return True
+
+
+class Search(ReplayedTuner):
+    """Generations of points, scored on drives."""
 
     rows: int
     """Number of sets of weights in a point."""
@@ -67,13 +107,7 @@ class Search(Tuner):
         return {"judged": self.scores, "solves": self._solves}
 
     def replay(self, state: Mapping[str, Any]) -> None:
-        """Repeat the search with the scores of a state.
-
-        Raises
-        ------
-        ValueError, KeyError, TypeError
-            If the state does not fit.
-        """
+        """Repeat the search with the scores of a state."""
         scores = [[float(score) for score in row] for row in state["judged"]]
         solves = int(state["solves"])
         for row in scores:
@@ -83,14 +117,6 @@ class Search(Tuner):
                 raise ValueError("its scores are not finite")
             self.tell(row)
         self.scores, self._solves = scores, solves
-
-    def save(self, folder: Path) -> None:
-        """Write the scores so far."""
-        write_state(folder, self.state)
-
-    def read_state(self, folder: Path) -> bool:
-        """Repeat the search with the scores that `save` wrote; False if there are none."""
-        return read_state(folder, self.replay)
 
     @abstractmethod
     def ask(self) -> list[Array]:
@@ -260,7 +286,7 @@ class GradientSearch(Search):
         return mean.reshape(self.rows, self.entries)
 
 
-class PathClassSearch(Tuner):
+class PathClassSearch(ReplayedTuner):
     """A search for each class of path; the schedule is for the selection "path".
 
     A class without paths, or whose share of the budget allows no generation, takes the set of the
@@ -310,19 +336,15 @@ class PathClassSearch(Tuner):
         figures = [search.step() for search in self.searches.values() if not search.done]
         return {key: float(np.mean([each[key] for each in figures])) for key in figures[0]}
 
-    def save(self, folder: Path) -> None:
-        """Write the scores of all classes at once."""
-        states = {self.bands.names[band]: search.state for band, search in self.searches.items()}
-        write_state(folder, states)
+    @property
+    def state(self) -> dict[str, Any]:
+        """Scores and solves of every class so far, in plain JSON."""
+        return {self.bands.names[band]: search.state for band, search in self.searches.items()}
 
-    def read_state(self, folder: Path) -> bool:
-        """Repeat the searches with the scores that `save` wrote; False if there are none."""
-
-        def replay(content: Mapping[str, Any]) -> None:
-            for band, search in self.searches.items():
-                search.replay(content[self.bands.names[band]])
-
-        return read_state(folder, replay)
+    def replay(self, state: Mapping[str, Any]) -> None:
+        """Repeat the searches with the scores of a state."""
+        for band, search in self.searches.items():
+            search.replay(state[self.bands.names[band]])
 
     def result(self, provenance: Mapping[str, Any]) -> WeightSchedule:
         """Return a schedule with a set for each class."""
@@ -332,34 +354,6 @@ class PathClassSearch(Tuner):
         }
         rows = [found[min(found, key=lambda b: abs(b - band))] for band in range(len(self.bands))]
         return schedule_of(np.array(rows), provenance)
-
-
-def write_state(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write the state of a search atomically."""
-    write_atomically(folder / STATE, json.dumps({"format": FORMAT, **content}).encode())
-
-
-def read_state(folder: Path, replay: Callable[[Any], None]) -> bool:
-    """Call `replay` with the state of a folder; False if there is none.
-
-    Raises
-    ------
-    ValueError
-        In one line, if the file cannot be used.
-    """
-    file = folder / STATE
-    if not file.exists():
-        return False
-    try:
-        content = json.loads(file.read_text())
-        if content["format"] != FORMAT:
-            raise ValueError(f"its format is {content['format']!r}, not {FORMAT!r}")
-        replay(content)
-    except KeyError as error:
-        raise ValueError(unusable(file, f"no {error} in it")) from None
-    except (OSError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise ValueError(unusable(file, str(error))) from None
-    return True
 
 
 def evolution(settings: TuningSettings, size: int, seed: int) -> Any:

@@ -30,9 +30,8 @@ from experiments.jobs.paths import (
 from experiments.run.case import run_case
 from experiments.run.suites import HELD_OUT, SIX
 from experiments.training import ALGORITHMS
-from experiments.training.loop import make_trainer, path_names, train
+from experiments.training.loop import cases, make_trainer, path_names, train, validate
 from experiments.training.settings import HYPERPARAMETERS, REWARD, TrainingSettings, usual
-from experiments.training.validation import cases, validate
 from lpv_track_env.vehicle import VEHICLES
 
 TINY: dict[str, dict[str, Any]] = {
