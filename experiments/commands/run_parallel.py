@@ -128,7 +128,7 @@ def verdict(outcome: "Outcome", summary: "Summary") -> int:
 
 def _bench(folder: Path, console: Console) -> int:
     """Measure the mailbox, print a table, write `mailbox.json`; return the exit code."""
-    from experiments.parallel.bench import bench_mailbox
+    from experiments.parallel.mailbox_bench import bench_mailbox
 
     result = {"format": FORMAT, **measured_on()}
     _write(result, folder / MAILBOX_FILE)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from agents import Agent
 from agents.base import stopping_acceleration
+from experiments.parallel.child_processes import ATTACHED, READY, Link, quiet
 from experiments.parallel.mailbox import Reader, Writer
-from experiments.parallel.processes import ATTACHED, READY, Link, quiet
 from experiments.parallel.setup import (
     COMMAND,
     DRIVING,

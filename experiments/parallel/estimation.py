@@ -6,8 +6,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from experiments.parallel.child_processes import ATTACHED, READY, Link, quiet
 from experiments.parallel.mailbox import Reader, Writer
-from experiments.parallel.processes import ATTACHED, READY, Link, quiet
 from experiments.parallel.setup import ESTIMATE, MS_PER_SECOND, SAMPLE, Setup
 from lpv_track_env import vehicle
 from lpv_track_env.conditions.layout import MAX_STEERING_OFFSET

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.parallel.setup import DRIVING, REASONS, Setup
-from experiments.parallel.vehicle import StaleBraking, Vehicle
+from experiments.parallel.simulated_vehicle import StaleBraking, Vehicle
 from experiments.run.metrics import rms
 from lpv_track_env.bicycle import PSI, VX, X, Y
 

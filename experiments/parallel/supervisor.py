@@ -7,10 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from experiments.parallel.control import control
-from experiments.parallel.estimation import estimate
-from experiments.parallel.mailbox import Mailbox, Message, Reader
-from experiments.parallel.processes import (
+from experiments.parallel.child_processes import (
     ATTACHED,
     READY,
     Child,
@@ -19,6 +16,9 @@ from experiments.parallel.processes import (
     quiet,
     wait_until,
 )
+from experiments.parallel.control import control
+from experiments.parallel.estimation import estimate
+from experiments.parallel.mailbox import Mailbox, Message, Reader
 from experiments.parallel.recording import Outcome, Recording
 from experiments.parallel.setup import (
     COMMAND,
@@ -29,7 +29,7 @@ from experiments.parallel.setup import (
     STALE_PERIODS,
     Setup,
 )
-from experiments.parallel.vehicle import Sensors, Vehicle
+from experiments.parallel.simulated_vehicle import Sensors, Vehicle
 
 START_TIMEOUT = 180.0
 """Time for both processes to import, and to compile if numba's cache is empty, s."""

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.report import replay
+from experiments.report import drive_replay
+from experiments.report.agent_comparison import comparison_section, curvature_section
 from experiments.report.appendix import errata_section, manifest_section
-from experiments.report.comparison import comparison_section, curvature_section
-from experiments.report.computing import computing_section, learning_section
+from experiments.report.cost import computing_section, learning_section
 from experiments.report.drives import Result, drives_of, in_families
 from experiments.report.page import Document, line_styles
 from experiments.report.sideslip import sideslip_section
@@ -53,7 +53,7 @@ def build(cases: Sequence[Result], store: ResultStore) -> str:
     document = Document()
     document.section("Summary", summary_section(document, kept, len(cases) - len(kept)))
     figure_sections(document, drives, missing, styles)
-    document.section("Replay", replay.replay_section(drives), printed=False)
+    document.section("Replay", drive_replay.replay_section(drives), printed=False)
     document.section("Against the published table", comparison_section(document, kept, rows))
     document.section("By curvature", curvature_section(document, kept, styles))
     document.section("Computing time", computing_section(document, drives, styles))
@@ -65,7 +65,7 @@ def build(cases: Sequence[Result], store: ResultStore) -> str:
     document.section("What learning cost", learning_section(document, kept))
     document.section("Errata of the paper", errata_section())
     document.section("Settings and provenance", manifest_section(document, manifest, kept))
-    scripts = (replay.SCRIPT,) if drives else ()
+    scripts = (drive_replay.SCRIPT,) if drives else ()
     return document.render("Path tracking benchmark", subtitle(manifest), scripts)
 
 

@@ -5,7 +5,15 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.report.charts import (
+from experiments.report.drives import (
+    Drive,
+    by_trajectory,
+    foot_points,
+    longest_trace,
+    reference_line,
+)
+from experiments.report.page import LineStyle, Panel
+from experiments.report.svg_charts import (
     BOTTOM,
     LEFT,
     RIGHT,
@@ -17,14 +25,6 @@ from experiments.report.charts import (
     exactly,
     spread,
 )
-from experiments.report.drives import (
-    Drive,
-    by_trajectory,
-    foot_points,
-    longest_trace,
-    reference_line,
-)
-from experiments.report.page import LineStyle, Panel
 from lpv_track_env.bicycle import PSI, VX, X, Y
 
 Array = NDArray[np.float64]

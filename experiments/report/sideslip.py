@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.report.charts import Chart, around, decimate, exactly, spread
 from experiments.report.drive_figures import POINTS, reference_chart
 from experiments.report.drives import (
     Drive,
@@ -26,6 +25,7 @@ from experiments.report.page import (
     legend,
     paragraph,
 )
+from experiments.report.svg_charts import Chart, around, decimate, exactly, spread
 from experiments.run import tables
 from lpv_track_env.bicycle import VX, VY, X, Y
 from lpv_track_env.vehicle import VehicleParameters

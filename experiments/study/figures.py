@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from agents.weight_tuning.policy import load
 from agents.weights import TrackingWeights
-from experiments.report.charts import Chart, Scale, around, decades
 from experiments.report.page import Panel, Styles
+from experiments.report.svg_charts import Chart, Scale, around, decades
 from experiments.run.metrics import BANDS
 from experiments.run.statistics import Interval
 from experiments.study.evaluation import EvaluationSet, loop_with

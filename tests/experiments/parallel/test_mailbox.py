@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.parallel import bench
+from experiments.parallel import mailbox_bench
 from experiments.parallel.mailbox import FRONT, Mailbox, MailboxError, Reader, Writer
 
 RECORD = np.dtype([("number", np.int64), ("values", np.int64, (50,)), ("sum", np.int64)])
@@ -232,7 +232,7 @@ def test_the_name_is_gone_while_both_sides_go_on() -> None:
 
 
 def test_the_bench_measures_every_value_that_was_taken() -> None:
-    latencies = bench.measure("mailbox (pipe)", 30)
+    latencies = mailbox_bench.measure("mailbox (pipe)", 30)
     # Values that the reader of a busy machine missed are left out.
     assert 1 <= len(latencies) <= 30
     assert (latencies > 0.0).all()

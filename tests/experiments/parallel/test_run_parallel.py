@@ -18,7 +18,7 @@ import pytest
 
 from experiments.commands.run_parallel import verdict
 from experiments.parallel import control
-from experiments.parallel.processes import Child, Link, Stop
+from experiments.parallel.child_processes import Child, Link, Stop
 from experiments.parallel.recording import COMPLETE, Outcome, Recording, summarise, timing
 from experiments.parallel.setup import (
     COMMAND,
@@ -31,8 +31,8 @@ from experiments.parallel.setup import (
     STALE_ESTIMATE,
     Setup,
 )
+from experiments.parallel.simulated_vehicle import Sensors, Vehicle
 from experiments.parallel.supervisor import run
-from experiments.parallel.vehicle import Sensors, Vehicle
 from lpv_track_env import conditions
 from lpv_track_env.vehicle import VEHICLES
 from tests.helpers import faulty_agents

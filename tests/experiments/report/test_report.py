@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from experiments.report import charts, sideslip
+from experiments.report import sideslip, svg_charts
 from experiments.report.appendix import ERRATA
 from experiments.report.build import write_report
 from experiments.report.drives import reference_path, usable
@@ -367,8 +367,8 @@ def test_steady_sideslip_is_lr_kappa_at_low_speed_and_that_of_a_long_turn():
 @pytest.mark.parametrize("n", [1, 2, 599, 600, 601, 1199, 5000, 100_001])
 def test_decimation_keeps_ends_and_extremes(n):
     values = np.random.default_rng(n).normal(size=n)
-    kept = charts.decimate(values)
-    assert len(kept) <= charts.POINTS
+    kept = svg_charts.decimate(values)
+    assert len(kept) <= svg_charts.POINTS
     assert (np.diff(kept) > 0).all()
     assert {0, n - 1} <= set(kept.tolist())
     assert values[kept].max() == values.max()

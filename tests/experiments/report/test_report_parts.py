@@ -8,12 +8,12 @@ import re
 import numpy as np
 import pytest
 
-from experiments.report import charts, replay
-from experiments.report.charts import Scale, around, decades, exactly
+from experiments.report import drive_replay, svg_charts
 from experiments.report.drive_figures import magnified
 from experiments.report.drives import Drive, families, foot_points, in_families
 from experiments.report.page import LineStyle, asset
 from experiments.report.summary import over_seeds
+from experiments.report.svg_charts import Scale, around, decades, exactly
 from experiments.run.statistics import rate_interval
 from tests.helpers.made_results import HOSTILE, case, folder_of, page, trace
 
@@ -76,18 +76,18 @@ def distance(point, line):
 def test_a_simplified_line_passes_by_every_point_it_left_out():
     rng = np.random.default_rng(1)
     points = np.column_stack([np.arange(300.0), np.cumsum(rng.normal(size=300))])
-    kept = charts.simplify(points, 1.5)
+    kept = svg_charts.simplify(points, 1.5)
     assert 2 < len(kept) < 200
     assert (kept[[0, -1]] == points[[0, -1]]).all()
     assert max(distance(point, kept) for point in points) <= 1.5
-    assert len(charts.simplify(np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]), 0.1)) == 2
+    assert len(svg_charts.simplify(np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]), 0.1)) == 2
     # There and back again: ends that meet are no reason to drop what lies between.
     loop = np.array([[0.0, 0.0], [5.0, 5.0], [0.0, 0.0]])
-    assert len(charts.simplify(loop, 0.1)) == 3
+    assert len(svg_charts.simplify(loop, 0.1)) == 3
 
 
 def drawn(data):
-    """Return the points of path data written by `charts.polyline`."""
+    """Return the points of path data written by `svg_charts.polyline`."""
     x, y, rest = re.fullmatch(r"M(-?\d+) (-?\d+)l(.*)", data).groups()
     steps = np.array([int(number) for number in re.findall(r"-?\d+", rest)]).reshape(-1, 2)
     return np.cumsum(np.vstack([[int(x), int(y)], steps]), axis=0)
@@ -95,23 +95,23 @@ def drawn(data):
 
 def test_path_data_leads_through_the_points():
     points = np.array([[10, -5], [12, 7], [12, 7], [0, -20], [-3, 0]])
-    np.testing.assert_array_equal(drawn(charts.polyline(points)), points[[0, 1, 3, 4]])
+    np.testing.assert_array_equal(drawn(svg_charts.polyline(points)), points[[0, 1, 3, 4]])
     still = np.array([[1, 2], [1, 2]])
-    np.testing.assert_array_equal(drawn(charts.polyline(still)), still)
+    np.testing.assert_array_equal(drawn(svg_charts.polyline(still)), still)
 
 
 def test_a_line_stands_where_its_axes_say_and_breaks_where_it_is_not_finite():
-    chart = charts.Chart(Scale(0.0, 10.0), Scale(0.0, 1.0))
+    chart = svg_charts.Chart(Scale(0.0, 10.0), Scale(0.0, 1.0))
     x = np.array([0.0, 5.0, 6.0, 7.0, 10.0])
     chart.line(x, np.array([0.0, 1.0, np.nan, 0.5, 0.0]), "c0")
     first, second = re.findall(r"M[^M\"]+", chart.svg().split('class="l c0" d="')[1].split('"')[0])
-    wide, high = charts.FINE * chart.plot_width, charts.FINE * chart.plot_height
+    wide, high = svg_charts.FINE * chart.plot_width, svg_charts.FINE * chart.plot_height
     np.testing.assert_allclose(drawn(first), [[0, high], [wide / 2, 0]], atol=0.5)
     np.testing.assert_allclose(drawn(second), [[0.7 * wide, high / 2], [wide, high]], atol=0.5)
 
 
 def test_words_on_a_chart_are_escaped():
-    chart = charts.Chart(
+    chart = svg_charts.Chart(
         Scale(0.0, 1.0), Scale(0.0, 1.0), x_label=HOSTILE, y_label=HOSTILE, x_names=[HOSTILE]
     )
     chart.note(HOSTILE, 0.5, 0.5)
@@ -206,7 +206,7 @@ def restored(packed, count):
 
 def test_embedded_quantities_are_the_traces_to_16_bits():
     made = drive()
-    moments = json.loads(json.dumps(replay.moments(made)))
+    moments = json.loads(json.dumps(drive_replay.moments(made)))
     assert moments["count"] == 300
     assert moments["duration"] == pytest.approx(made.trace["time"][-1])
     values = {name: restored(packed, 300) for name, packed in moments["values"].items()}
@@ -221,9 +221,9 @@ def test_embedded_quantities_are_the_traces_to_16_bits():
 
 def test_long_drives_are_thinned_evenly_in_time():
     long = Drive("a", "T1", case(1), trace(n=4000))
-    moments = replay.moments(long)
-    assert moments["count"] == replay.SAMPLES
-    x = restored(moments["values"]["x"], replay.SAMPLES)
+    moments = drive_replay.moments(long)
+    assert moments["count"] == drive_replay.SAMPLES
+    x = restored(moments["values"]["x"], drive_replay.SAMPLES)
     np.testing.assert_allclose(np.diff(x), np.diff(x).mean(), atol=0.05)
 
 
@@ -232,18 +232,18 @@ def test_whole_settings_are_embedded_while_they_fit():
         drive(1), drive(2, "pid"), drive(3, vehicle="course-car"),
         drive(4, conditions="realtime"), drive(5, "pid", vehicle="course-car"),
     ]  # fmt: skip
-    size = max(len(text) for _, text in replay.chosen(drives))
-    everything = replay.chosen(drives)
+    size = max(len(text) for _, text in drive_replay.chosen(drives))
+    everything = drive_replay.chosen(drives)
     assert [one.case["id"][-1] for one, _ in everything] == ["1", "2", "4", "3", "5"]
-    three = replay.chosen(drives, budget=4 * size)
+    three = drive_replay.chosen(drives, budget=4 * size)
     assert [one.case["id"][-1] for one, _ in three] == ["1", "2", "4"]
-    assert [one.case["id"][-1] for one, _ in replay.chosen(drives, budget=size)] == ["1"]
-    assert replay.chosen([]) == []
+    assert [one.case["id"][-1] for one, _ in drive_replay.chosen(drives, budget=size)] == ["1"]
+    assert drive_replay.chosen([]) == []
 
 
 def test_no_name_ends_the_script_that_holds_the_data():
     name = "</script><script>alert(1)</script><!--"
-    block = replay.data_block(replay.chosen([drive(1, agent=name, trajectory=name)]))
+    block = drive_replay.data_block(drive_replay.chosen([drive(1, agent=name, trajectory=name)]))
     head, content = block.removesuffix("</script>").split(">", 1)
     assert "<" not in content
     assert json.loads(content)["runs"][0]["agent"] == name

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.report.charts import spread
 from experiments.report.drives import (
     Drive,
     by_setting,
@@ -19,6 +18,7 @@ from experiments.report.drives import (
     reference_line,
 )
 from experiments.report.page import joined, paragraph
+from experiments.report.svg_charts import spread
 from lpv_track_env.bicycle import PSI, VX, X, Y
 
 Array = NDArray[np.float64]

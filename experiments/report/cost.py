@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.report.charts import Chart, Scale, decades
 from experiments.report.drives import Drive, Result, by_setting, family_of
 from experiments.report.page import (
     Document,
@@ -18,6 +17,7 @@ from experiments.report.page import (
     legend,
     paragraph,
 )
+from experiments.report.svg_charts import Chart, Scale, decades
 from experiments.run.learning_cost import UNKNOWN, duration
 from experiments.run.tables import trainings
 

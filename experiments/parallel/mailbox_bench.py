@@ -12,8 +12,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from experiments.parallel.child_processes import READY, Child, Link, quiet
 from experiments.parallel.mailbox import Mailbox, Message, Reader
-from experiments.parallel.processes import READY, Child, Link, quiet
 from experiments.parallel.setup import ESTIMATE
 
 VALUES = 1000

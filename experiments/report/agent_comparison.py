@@ -2,8 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from experiments.report.charts import BOTTOM, TOP, Chart, Scale, decades
-from experiments.report.computing import TRAINED_NOTE
+from experiments.report.cost import TRAINED_NOTE
 from experiments.report.drives import Result, family_of, main_family, per_setting
 from experiments.report.page import (
     Cell,
@@ -17,6 +16,7 @@ from experiments.report.page import (
     legend,
     paragraph,
 )
+from experiments.report.svg_charts import BOTTOM, TOP, Chart, Scale, decades
 from experiments.report.tracking import condition_styles
 from experiments.run import published, tables
 from experiments.run.agent_tables import BAND_NOTE, Line, band_lines, band_ranges
