@@ -69,7 +69,7 @@ class BaseCase(ABC):
 
     def files(self) -> list[Path | None]:
         """Return the files whose contents a result depends on, beside the project's sources."""
-        settings = [str(value) for value in self.agent_settings.values()]
+        settings = [value for value in self.agent_settings.values() if isinstance(value, str)]
         return [
             source_file(self.agent),
             *(Path(value) for value in settings if value.endswith(".json")),

@@ -1,4 +1,4 @@
-"""Computing times as delays: measured or recorded, in sequence or in parallel processes."""
+"""Computing times as delays: measured or recorded, of sequential or parallel processes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,47 +13,51 @@ Array = NDArray[np.float64]
 
 ARRANGEMENTS = ("sequential", "triggered", "free-running")
 LEVELS = 65
-"""Quantiles by which a distribution is kept."""
+"""Number of quantiles that represent a distribution."""
 
 
 def quantiles(times: ArrayLike) -> list[float]:
-    """A distribution of times (s) as its quantiles at equal steps, smallest to largest."""
+    """Return the quantiles of times (s) at equal steps, from the smallest to the largest."""
     return [float(q) for q in np.quantile(np.asarray(times), np.linspace(0.0, 1.0, LEVELS))]
 
 
 class ComputingTimes:
-    """What passes between readings and command, period by period: for `rollout`.
+    """Latency from readings to command in every period; an argument of `rollout`.
 
-    Arrangements of estimator and controller:
+    With t_e and t_c the times of estimator and controller, the arrangements are:
 
     sequential
-        One process: the estimate is made, then the command. It takes t_e + t_c, and so long the
-        process is busy.
+        One process computes the estimate, then the command. Latency and busy time are t_e + t_c.
     triggered
-        Two processes: each estimate sets the controller off. It takes t_e + t_c and the mailbox;
-        busy is the slower of the two.
+        Two processes; each estimate starts the controller. Latency is t_e + t_c plus the mailbox's
+        delay; the slower of the two decides how long the controller is busy.
     free-running
-        Two processes with clocks of their own: a command starts from the newest estimate, whose
-        age is anything up to a period beyond t_e. So latency has that wait on top.
+        Two processes with clocks of their own; a command starts from the newest estimate. That is
+        up to a period older than t_e, which adds to the latency.
 
     Parameters
     ----------
     arrangement
         One of `ARRANGEMENTS`.
     estimation
-        Times of the estimator, s: quantiles at equal steps, from the smallest to the largest (one
-        number: that time).
+        Times of the estimator, s: a constant, or quantiles at equal steps from the smallest to the
+        largest.
     control
-        Those of the controller, or "measured": what the agent's `predict` took, here and now, and
-        so never twice the same.
+        Times of the controller, likewise, or "measured": the duration of the agent's `predict`,
+        which differs from run to run.
     mailbox
-        s from one process to another.
+        Delay from one process to the other, s.
     load
-        Factor on both times: a slower computer.
+        Factor on both times, for a slower computer.
     period
         Control period, s.
     seed
-        Of the draws.
+        Seed of the draws.
+
+    Raises
+    ------
+    ValueError
+        For an unknown arrangement, or times that are negative or not finite.
     """
 
     def __init__(
@@ -77,12 +81,12 @@ class ComputingTimes:
         self._mailbox, self._load, self._period = mailbox, load, period
         self._rng = np.random.default_rng([seed, ARRANGEMENTS.index(arrangement)])
         self.latencies: list[float] = []
-        """Of every period so far, s."""
+        """Latency of every period so far, s."""
 
     def __call__(self, step: int, seconds: float) -> tuple[float, float]:
-        """Latency of a step's command and how long its computation occupies the controller, s."""
+        """Return the latency of a step's command and the time the controller is busy with it, s."""
         del step
-        # The same number of draws whatever the arrangement: only it differs between two runs.
+        # The same draws for every arrangement, so that runs differ in the arrangement alone.
         first, second, wait = self._rng.random(3)
         estimation = self._load * _at(self._estimation, first)
         control = self._load * (seconds if self._control is None else _at(self._control, second))
@@ -92,14 +96,14 @@ class ComputingTimes:
             latency += self._mailbox
             occupied = max(estimation, control)
         if self.arrangement == "free-running":
-            # The newest estimate is up to a period old, or as long as its making takes.
+            # The newest estimate is up to a period old, or as old as its computation is long.
             latency += wait * max(self._period, estimation)
         latency, occupied = min(latency, LONGEST_DELAY), min(occupied, LONGEST_DELAY)
         self.latencies.append(latency)
         return latency, occupied
 
     def summary(self) -> dict[str, Any]:
-        """Median, p99, mean and largest latency, s."""
+        """Return the median, mean, p99 and largest latency, s."""
         values = np.array(self.latencies)
         return {
             "median": float(np.median(values)),
@@ -117,5 +121,5 @@ def _checked(name: str, times: Sequence[float] | float) -> Array:
 
 
 def _at(levels: Array, share: float) -> float:
-    """A distribution's value at a share of its probability."""
+    """Return the quantile of a distribution at a probability."""
     return float(np.interp(share, np.linspace(0.0, 1.0, len(levels)), levels))

@@ -62,7 +62,7 @@ class Interrupts:
 def in_process(
     specs: Sequence[Spec], run: Run, started: Callable[[Spec], None] | None = None
 ) -> Iterator[Result]:
-    """Run cases one after another here."""
+    """Run specs one after another in this process."""
     for spec in specs:
         if started is not None:
             started(spec)
@@ -76,9 +76,20 @@ def local_pool(
     died: Run,
     started: Callable[[Spec], None] | None = None,
 ) -> Iterator[Result]:
-    """Run cases over `workers` processes and yield results as they end.
+    """Run specs over `workers` processes and yield results as they end.
 
-    `died` makes the result of a case that killed its worker twice.
+    Parameters
+    ----------
+    specs
+        Arguments of `run`.
+    workers
+        Number of processes.
+    run
+        Function that makes a result; it must be picklable.
+    died
+        Function that makes the result of a spec that killed its worker twice.
+    started
+        Called with each spec as it starts.
 
     Raises
     ------
@@ -105,7 +116,7 @@ def local_pool(
 
 
 def _begin_worker() -> None:
-    """Leave Ctrl-C to the parent, and end with it even if it is killed."""
+    """Ignore Ctrl-C, which the parent handles, and end when the parent ends or is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -120,7 +131,7 @@ def _begin_worker() -> None:
 def _pool(
     specs: Sequence[Spec], workers: int, run: Run, started: Callable[[Spec], None] | None
 ) -> Generator[Result, None, tuple[list[Spec], list[Spec]] | None]:
-    """Run cases in one pool; return (those in flight, those not begun) if it breaks, else None."""
+    """Run specs in one pool; if it breaks, return those in flight and those not started."""
     context = multiprocessing.get_context("spawn")
     queue = list(specs)
     running: dict[Future[Result], Spec] = {}
@@ -137,7 +148,7 @@ def _pool(
                 if started is not None:
                     started(spec)
             done, _ = wait(running, return_when=FIRST_COMPLETED)
-            # Of a pool that broke, what had ended before is still to be read.
+            # Results from before the pool broke are still valid.
             ended = [future for future in done if not _broken(future)]
             for future in ended:
                 running.pop(future)
@@ -146,7 +157,7 @@ def _pool(
                 unfinished = list(running.values()), queue
                 break
     except BaseException:
-        # Interrupted, or the consumer stopped: do not wait for cases nobody will read.
+        # Interrupted, or the consumer stopped: do not wait for results that nobody reads.
         for process in list((getattr(pool, "_processes", None) or {}).values()):
             process.terminate()
         raise

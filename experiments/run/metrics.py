@@ -1,4 +1,4 @@
-"""Metrics of an episode: the paper's, by its formulas, and what they leave out.
+"""Metrics of an episode: the paper's, by its formulas, and further ones.
 
 e_d is the lateral error (left positive), e_th the heading error in (-pi, pi]; T the episode's
 duration (kumar2025lpv, section V)::
@@ -10,7 +10,7 @@ duration (kumar2025lpv, section V)::
 ALE and AOE are root mean squares, whatever their name says. With the reference point (x_r, y_r) at
 the foot of the perpendicular, |CTE| is |e_d|, so Max CTE equals MLE and Mean CTE never exceeds ALE.
 The published tables have Mean CTE above ALE; their reference point must be another one, for example
-where the reference would be by the clock. That distance is given separately.
+the reference's position at the same time. That distance is given separately.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ BANDS = CurvatureBands()
 
 
 def rms(time: Array, values: Array) -> float:
-    """sqrt(1/T int values^2 dt) by the trapezoidal rule; 0 for an episode of no duration."""
+    """Compute sqrt(1/T int values^2 dt) by the trapezoidal rule; 0 for an empty episode."""
     duration = time[-1] - time[0]
     if duration <= 0:
         return 0.0
@@ -38,14 +38,14 @@ def rms(time: Array, values: Array) -> float:
 
 
 def cross_track_error(trace: Trace, path: ReferencePath) -> Array:
-    """CTE by the paper's formula, with the foot point as reference point, (n + 1,) m."""
+    """Compute the CTE by the paper's formula with the foot point as reference point, (n + 1,) m."""
     foot = path.sample(trace.arc_length)
     dx, dy = trace.state[:, X] - foot.x, trace.state[:, Y] - foot.y
     return dx * np.sin(foot.heading) - dy * np.cos(foot.heading)
 
 
 def time_indexed_distance(trace: Trace, path: ReferencePath) -> Array:
-    """Distance to where the reference, started with the episode, is by the clock, (n + 1,) m."""
+    """Compute the distance to the reference's position at the same time, (n + 1,) m."""
     start = path.sample(trace.arc_length[0]).time
     clock = path.arc_length_at(trace.time + float(start))
     there = path.sample(np.minimum(clock, path.length) if not path.closed else clock)
@@ -53,7 +53,7 @@ def time_indexed_distance(trace: Trace, path: ReferencePath) -> Array:
 
 
 def tracking(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
-    """The paper's six metrics, and errors of speed and against the clock."""
+    """Compute the paper's six metrics, errors of speed, and distances at the same time."""
     del vehicle
     cte = np.abs(cross_track_error(trace, path))
     clock = time_indexed_distance(trace, path)
@@ -74,18 +74,18 @@ def tracking(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> d
 
 
 def by_band(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
-    """Errors and share of time in each band of |curvature| at the foot point.
+    """Compute errors and share of time in each band of |curvature| at the foot point.
 
     For a band NAME, e the lateral and th the heading error, w the trapezoidal rule's weights::
 
         share_NAME = sum w / T          mle_NAME = max |e|
         ale_NAME = sqrt(sum w e^2 / sum w)          aoe_NAME = sqrt(sum w th^2 / sum w)
 
-    over the samples of the band; m, rad and a share of 1. A sample belongs to its band with all of
-    its weight, half of the step before and half of the one after: where a step leads from one band
-    to another, its middle is the border. So shares sum to 1, share * ale^2 to ALE^2 of the episode,
-    share * aoe^2 to its AOE^2, and the largest mle is its MLE. A band that the episode never visits
-    has no entries. An episode of no duration has, as in `metrics.rms`, ale and aoe 0, and share 1.
+    over the samples of the band; m, rad and a share of 1. A sample's weight, half of the step
+    before and half of the step after, counts for its band, so a step between two bands is divided
+    at its middle. Shares sum to 1, share * ale^2 to ALE^2 of the episode, share * aoe^2 to its
+    AOE^2, and the largest mle is its MLE. A band that the episode never visits has no entries. An
+    episode of no duration has, as in `rms`, ale and aoe 0, and share 1.
     """
     del vehicle
     band = BANDS.classify(path.sample(trace.arc_length).curvature)
@@ -107,23 +107,23 @@ def by_band(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> di
 
 
 def trapezoidal_weights(time: Array) -> Array:
-    """Weights w (n,) in s with int f dt = sum w f by the trapezoidal rule, at times (n,) in s."""
+    """Return the trapezoidal rule's weights w (n,), s: int f dt = sum w f at times (n,), s."""
     return 0.5 * (np.diff(time, append=time[-1]) + np.diff(time, prepend=time[0]))
 
 
 def weighted_rms(weight: Array, values: Array) -> float:
-    """sqrt(sum w values^2 / sum w), both (n,); 0 where all weights are."""
+    """Compute sqrt(sum w values^2 / sum w), both (n,); 0 if all weights are 0."""
     total = float(weight.sum())
     return float(np.sqrt((weight @ values**2) / total)) if total > 0.0 else 0.0
 
 
 def activity(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
-    """How much the actuators work: total variation, and the rms of their rates."""
+    """Compute the actuators' activity: total variation, and the rms of their rates."""
     del path, vehicle
     dt = np.diff(trace.time)
     steering = np.diff(trace.steering_angle)
     acceleration = np.diff(trace.acceleration)
-    # The first entry is what was in force before the first command.
+    # The first entry is the value before the first command.
     return {
         "steering_variation": float(np.abs(steering).sum()),
         "acceleration_variation": float(np.abs(acceleration).sum()),
@@ -134,11 +134,11 @@ def activity(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> d
 
 
 def violations(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
-    """By how much the paper's constraints were broken by what was driven: largest excess, share.
+    """Compute the violation of the paper's constraints: largest excess, share of periods.
 
     Each constraint gives `excess_NAME` (its own unit, 0 if kept) and `violated_NAME`, the share of
-    control periods in which it was broken by more than 1e-3 of its unit. Accelerations dvx/dt are
-    the vector field's at the state a period begins with, under the input held over it.
+    control periods in which it was violated by more than 1e-3 of its unit. Accelerations dvx/dt are
+    those of the vector field at the start of a period, under the input held over it.
     """
     del path
     vx, vy = trace.state[:, VX], trace.state[:, VY]
@@ -163,9 +163,9 @@ def violations(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) ->
 
 
 def knowledge(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
-    """How well the estimate knew the vehicle, and how often commands or fixes failed to come.
+    """Compute errors of the estimate, the share of periods braked by itself, deadline misses.
 
-    All zero under ideal conditions. The lateral error of the estimate is across the path.
+    All are zero under ideal conditions. The lateral error of the estimate is across the path.
     """
     del vehicle
     foot = path.sample(trace.arc_length)
@@ -188,16 +188,16 @@ METRICS: tuple[Callable[[Trace, ReferencePath, VehicleParameters], dict[str, flo
     violations,
     knowledge,
 )
-"""Every function's entries go into a case's `metrics`; add your own here."""
+"""Functions whose entries form a case's `metrics`; add your own here."""
 
 
 def evaluate(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
-    """All metrics of an episode."""
+    """Compute all metrics of an episode."""
     values: dict[str, float] = {}
     for metric in METRICS:
         values |= metric(trace, path, vehicle)
     covered = trace.arc_length[-1] - trace.arc_length[0]
-    # A closed path is driven for one lap from wherever the episode began.
+    # A closed path is driven for one lap from the start of the episode.
     distance = path.length if path.closed else path.length - trace.arc_length[0]
     return {
         **values,

@@ -1,4 +1,4 @@
-"""Published results of kumar2025lpv, to be printed beside ours; metres and radians."""
+"""Published results of kumar2025lpv, in metres and radians."""
 
 COLUMNS = ("max_cte", "mean_cte", "mle", "ale", "moe", "aoe")
 LABELS = {
@@ -32,9 +32,10 @@ REALTIME: dict[str, tuple[float, ...]] = {
 
 
 def row(trajectory: str, conditions: object = "simulation") -> dict[str, float] | None:
-    """Published row of a trajectory or of its raw form, by column; None for others.
+    """Return the published row of a trajectory or its raw form by column; None for others.
 
-    The simulation's under ideal conditions, under all others that of the runs with the vehicle.
+    Conditions "simulation" have the row of the paper's simulation, all others that of its runs with
+    the vehicle.
     """
     rows = SIMULATION if conditions == "simulation" else REALTIME
     values = rows.get(trajectory.removesuffix("-raw"))

@@ -1,4 +1,4 @@
-"""One episode: an agent drives an environment, and everything worth knowing is recorded."""
+"""Rollouts: an agent drives an environment for an episode, which is recorded as a trace."""
 
 import time
 from collections.abc import Callable, Generator
@@ -18,13 +18,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trace:
-    """What happened at the ends of n control periods, and (index 0) at the start: arrays (n + 1,).
+    """Record of an episode at its start (index 0) and at the ends of n periods: arrays (n + 1,).
 
-    `state` is (n + 1, 6): vx, vy, psi, r, X, Y; `estimate` is what the observation was made of,
-    under ideal conditions the state itself. `acceleration` and `steering_angle` are the actuators'
-    values in force at the end of the period (under ideal conditions, all through it). `solve_time`
-    (s) is the agent's whole `predict` call of that period, 0 at the start. `stopping` marks periods
-    in which the vehicle braked by itself, `deadline_misses` counts computations that came too late.
+    `state` is (n + 1, 6): vx, vy, psi, r, X, Y; `estimate` is the estimate that the observation is
+    made from, under ideal conditions the state itself. `acceleration` and `steering_angle` are the
+    actuators' values at the end of the period (under ideal conditions, throughout it). `solve_time`
+    (s) is the duration of the agent's `predict` call in that period, 0 at the start. `stopping`
+    marks periods in which the vehicle braked by itself, `deadline_misses` counts computations that
+    came too late.
     """
 
     time: Array
@@ -43,7 +44,7 @@ class Trace:
     deadline_misses: Array
 
     def as_dict(self) -> dict[str, Array]:
-        """Arrays by name."""
+        """Return the arrays by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
@@ -58,7 +59,7 @@ class Rollout:
     statuses: dict[str, int]
     """Solves by status, empty for agents that solve nothing."""
     fallbacks: dict[str, int]
-    """Steps in which something replaced a failed solve, by its name."""
+    """Number of steps in which a fallback replaced a failed solve, by its name."""
     solver_seconds: Array
     """Time inside the solver, (n,) s; empty for agents that solve nothing."""
     iterations: Array
@@ -97,13 +98,13 @@ def steps(
     options: dict[str, Any] | None = None,
     computing_time: Callable[[int, float], tuple[float, float]] | None = None,
 ) -> Generator[tuple[int, dict[str, Any]], None, Rollout]:
-    """Drive one episode step by step, for who drives several at a time.
+    """Drive one episode step by step, so that a caller can drive several side by side.
 
-    Yields each step's number, from 1, and its info with the agent's diagnostics under "agent".
-    `computing_time(k, seconds)`, given the time that the agent just took, says what passes until
-    the action of step k lands and until the next may be computed (s, s), see
-    `PathTrackingEnv.set_computing_time`. While the agent is busy with an earlier action it is not
-    asked for the next; its `solve_time` is 0 there.
+    Yields each step's number, from 1, and its info, with the agent's diagnostics under "agent" and
+    the observation before the step under "observation". `computing_time(k, seconds)` receives the
+    duration of the agent's call and returns the times (s, s) until the action of step k takes
+    effect and until the next may be computed, see `PathTrackingEnv.set_computing_time`. While the
+    agent is busy with an earlier action it computes no new one; its `solve_time` is 0 there.
     """
     observation, info = env.reset(seed=seed, options=options)
     inner: Any = env.unwrapped
@@ -154,19 +155,20 @@ def steps(
         start = np.array([False])
         if computing_time is not None and computed:
             inner.set_computing_time(*computing_time(len(rows) - 1, seconds))
+        before = observation
         observation, reward, terminated, truncated, info = env.step(action)
         done = terminated or truncated
         note(info, seconds, float(reward))
-        told = explain(memory[0]) if explain is not None and computed else {}
-        if told:
-            statuses[told["status"]] = statuses.get(told["status"], 0) + 1
-            if told["fallback"]:
-                fallbacks[told["fallback"]] = fallbacks.get(told["fallback"], 0) + 1
-            solver_seconds.append(told["seconds"])
-            iterations.append(told["iterations"])
-            if told["slack"] is not None:
-                slack = np.maximum(slack, told["slack"])
-        yield len(rows) - 1, {**info, "agent": told}
+        solve = explain(memory[0]) if explain is not None and computed else {}
+        if solve:
+            statuses[solve["status"]] = statuses.get(solve["status"], 0) + 1
+            if solve["fallback"]:
+                fallbacks[solve["fallback"]] = fallbacks.get(solve["fallback"], 0) + 1
+            solver_seconds.append(solve["seconds"])
+            iterations.append(solve["iterations"])
+            if solve["slack"] is not None:
+                slack = np.maximum(slack, solve["slack"])
+        yield len(rows) - 1, {**info, "agent": solve, "observation": before}
     table = np.array(rows).T
     trace = Trace(
         period * np.arange(len(rows)),

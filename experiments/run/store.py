@@ -1,8 +1,8 @@
-"""A folder of results: one fsynced JSON line a case, traces beside it, a manifest.
+"""Folder of results: a JSON line per case, traces beside it, a manifest.
 
 Layout: `manifest.json` (revision, versions, settings, hardware), `cases.jsonl`, `traces/ID.npz`.
-A run that was killed resumes: a torn last line is dropped, of several lines with one id the last
-counts, and files are replaced atomically.
+A run that was killed can be resumed: a torn last line is dropped, the last of several lines with
+one id counts, and files are replaced atomically.
 """
 
 import io
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 class ResultStore:
-    """Results of one benchmark in a folder, which is made if need be.
+    """Results of one benchmark in a folder, which is created if it does not exist.
 
     Raises
     ------
@@ -39,7 +39,7 @@ class ResultStore:
         folder.mkdir(parents=True, exist_ok=True)
 
     def append(self, result: Mapping[str, Any]) -> None:
-        """Keep one result: its trace first, then its line, both on disk when this returns."""
+        """Store one result: its trace first, then its line, both on disk when this returns."""
         line = {key: value for key, value in result.items() if key != "trace"}
         if result.get("trace"):
             buffer = io.BytesIO()
@@ -55,7 +55,7 @@ class ResultStore:
             os.fsync(handle.fileno())
 
     def _drop_torn_line(self) -> None:
-        """Cut what a killed writer left after the last complete line."""
+        """Remove an incomplete last line, left by a writer that was killed."""
         if not self.cases_file.exists():
             return
         with self.cases_file.open("rb+") as handle:
@@ -69,7 +69,9 @@ class ResultStore:
             handle.truncate(handle.read().rfind(b"\n") + 1)
 
     def cases(self) -> list[dict[str, Any]]:
-        """Results in the order of their first lines, without traces; the last line of an id counts.
+        """Return the results in the order of their first lines, without traces.
+
+        The last line of an id counts.
 
         Raises
         ------
@@ -93,7 +95,7 @@ class ResultStore:
         return list(found.values())
 
     def trace(self, case_id: str) -> dict[str, Array] | None:
-        """Arrays of a case's trace by name, or None where it was not kept or cannot be read."""
+        """Return the arrays of a case's trace by name, or None if it is missing or damaged."""
         file = self.folder / "traces" / f"{case_id}.npz"
         try:
             with np.load(file, allow_pickle=False) as arrays:
@@ -102,7 +104,7 @@ class ResultStore:
             return None
 
     def write_manifest(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Write and return what a result must carry to be reproduced."""
+        """Write and return the manifest, which holds what is needed to reproduce the results."""
         manifest = {
             "format": "lpv-track-results/1",
             "written": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -115,7 +117,7 @@ class ResultStore:
         return manifest
 
     def manifest(self) -> dict[str, Any]:
-        """The manifest, or {} where there is none."""
+        """Return the manifest, or {} without one."""
         try:
             content: dict[str, Any] = json.loads((self.folder / "manifest.json").read_text())
         except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Named lists of cases."""
+"""Suites: named lists of cases."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -11,22 +11,22 @@ Spec = dict[str, Any]
 
 SIX = tuple(PUBLISHED)
 PAPER_VEHICLES = ("m2-minibus", "course-car")
-"""Vehicles of `paper`; `lpv-track verify` and `speed` hold for these.
+"""Vehicles of `paper`, and of the random situations of `lpv-track verify` and `speed`.
 
 CommonRoad's cars, whose tyres are four times as stiff for their mass, leave lpv-nmpc without a
-solution in some percent of such wild situations, though never on the six.
+solution in some percent of such random situations, though never on the six.
 """
 RAW = tuple(f"{name}-raw" for name in SIX)
 RAW_PREVIEW = {"preview_steps": 30, "preview_period": 0.1}
 LEAST_SEEDS = 10
 HELD_OUT = tuple(f"random-{'fast-' * (seed % 2)}{seed}" for seed in range(20))
-"""Random paths that no training of `lpv-track train` has seen, nor its validation."""
+"""Random paths that `lpv-track train` uses neither for training nor for validation."""
 BESIDE = {"initial_error_range": [0.3, 0.1, 0.5]}
-"""Episodes that begin beside the path: in simulation, all that a seed can change."""
+"""Start beside the path; in simulation, a seed changes nothing else."""
 LEARNED = ("ppo", "sac", "bc")
-"""Shipped policies; they see 1 s ahead, too little to cut the corners of raw waypoints."""
+"""Shipped policies; their preview of 1 s is too short to cut the corners of raw waypoints."""
 DEMONSTRATION = "lpv-mpc-frozen"
-"""An agent that shows why not to drive so."""
+"""Agent that shows why the frozen form must not be used."""
 
 
 def grid(
@@ -38,7 +38,7 @@ def grid(
     seeds: Iterable[int] = (0,),
     **common: Any,
 ) -> list[Spec]:
-    """Every combination, the slowest agents first so that a pool ends evenly."""
+    """Return every combination, the slowest agents first so that a pool ends evenly."""
     named = sorted(agent_names, key=lambda name: not name.startswith("lpv-nmpc"))
     return [
         {
@@ -58,17 +58,17 @@ def grid(
 
 
 def quick(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
-    """A minute: every agent on T2 and a U-turn."""
+    """Every agent on T2 and a U-turn: a minute."""
     return grid(agent_names, ("T2", "u-turn"), seeds=seeds)
 
 
 def paper(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
-    """The paper's six in both speed modes, as raw waypoints, with the other vehicle, in real time.
+    """The paper's six in both speed modes, as raw waypoints, with another vehicle, in real time.
 
-    On raw waypoints a corner must be seen 3 s ahead to be cut: agents get 30 preview steps of
-    0.1 s there, and learned policies, made for 1 s, stay away. IPOPT's NMPC, which takes a hundred
-    times as long as all others together, drives the six at variable speed; `converged` has the
-    rest.
+    To cut a corner of raw waypoints an agent must see it 3 s ahead, so agents get 30 preview steps
+    of 0.1 s there, and learned policies, trained for 1 s, are left out. IPOPT's NMPC takes a
+    hundred times as long as all others together and drives the six at variable speed alone;
+    `converged` has the rest.
     """
     solved, fast = _by_speed(agent_names)
     specs = [
@@ -83,7 +83,7 @@ def paper(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
 
 
 def realtime(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
-    """The six under the conditions of a real vehicle, at least ten seeds, that intervals mean."""
+    """The six under the conditions of a real vehicle, with at least ten seeds for intervals."""
     return grid(agent_names, SIX, seeds=_several(seeds), conditions="realtime")
 
 
@@ -105,7 +105,7 @@ def learned(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
 
 
 def converged(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
-    """IPOPT's NMPC beside the real-time one on everything that `paper` leaves to the latter."""
+    """IPOPT's NMPC beside the real-time one on the cases that `paper` has only of the latter."""
     solved, _ = _by_speed(agent_names)
     both = [name for name in agent_names if name in {*solved, "lpv-nmpc"}]
     specs = [
@@ -117,7 +117,7 @@ def converged(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
 
 
 def sideslip(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
-    """`course-car` with and without the limit |vy| <= 0.17 vx in its way (errata, 5)."""
+    """`course-car` with the limit |vy| <= 0.17 vx and with a wider one (errata, 5)."""
     solved = [name for name in agent_names if name.startswith("lpv-nmpc")]
     car, wide = ("course-car",), {"max_lateral_velocity_ratio": 0.5}
     return [
@@ -127,7 +127,7 @@ def sideslip(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
 
 
 def frozen(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:  # noqa: ARG001
-    """Both forms of the LPV-MPC with frozen matrices beside the NMPC, whatever agents are named."""
+    """Both forms of the frozen LPV-MPC beside the NMPC; ignores the agents that are named."""
     return [
         *grid(("lpv-nmpc",), SIX, seeds=seeds),
         *grid((DEMONSTRATION,), SIX, seeds=seeds, agent_settings={"form": "literal"}),
@@ -136,7 +136,7 @@ def frozen(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:  # n
 
 
 def independent(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:  # noqa: ARG001
-    """The NMPC on cars that nobody here modelled, beside its own model of them; needs `plants`."""
+    """The NMPC on independent vehicle models instead of its own; needs the extra `plants`."""
     return [
         spec
         for plant in plants.names()
@@ -155,7 +155,7 @@ def _far_seeing(agent_names: Iterable[str]) -> list[str]:
 
 
 def _near_sighted(name: str) -> bool:
-    """Whether an agent is a policy file that was made for another preview than `RAW_PREVIEW`."""
+    """Return whether an agent is a policy file trained for another preview than `RAW_PREVIEW`."""
     if not name.endswith(".json"):
         return False
     from agents.learned.policy import read
@@ -165,7 +165,7 @@ def _near_sighted(name: str) -> bool:
 
 
 def _by_speed(agent_names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Agents that solve to convergence at every step, and all others."""
+    """Return the agents that solve to convergence at every step, and all others."""
     solved = [name for name in agent_names if name == "lpv-nmpc-ipopt"]
     return solved, [name for name in agent_names if name not in solved]
 
@@ -183,5 +183,5 @@ SUITES = {
 
 
 def default_agents() -> list[str]:
-    """Every agent to drive with that needs no more than this project's own packages."""
+    """Return the registered agents, without the demonstration."""
     return [name for name in agents.names() if name != DEMONSTRATION]

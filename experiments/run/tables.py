@@ -26,7 +26,7 @@ Result = Mapping[str, Any]
 
 CONFIDENCE = 0.95
 KEPT = 1e-3
-"""A constraint broken by no more than this, in its own unit, counts as kept (as in `metrics`)."""
+"""Largest excess, in a constraint's unit, that does not count as a violation (as in `metrics`)."""
 UNITS = {
     "speed": "m/s",
     "lateral_velocity": "m/s",
@@ -50,8 +50,6 @@ PUBLISHED_NOTE = (
     "with the vehicle. They are for orientation only, since its vehicle, weights and paths are not "
     "public."
 )
-
-
 LONGEST, CUT = 80, 48
 """Most characters of a setting's value in a label, and those that are kept of a longer one."""
 
@@ -132,7 +130,7 @@ def _changes(values: Mapping[str, Any]) -> str:
 def _value_words(value: Any) -> str:
     """Return a setting's value in a line; a long one is cut, its digest keeping it apart."""
     if isinstance(value, Mapping):
-        value = " ".join(f"{key}={_value_words(inner)}" for key, inner in value.items())
+        value = f"{{{_changes(value)}}}"
     text = str(value)
     if len(text) <= LONGEST:
         return text
@@ -150,7 +148,7 @@ def conditions_words(given: str | Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over runs, and the half width of its 95 % interval where there are several."""
+    """Mean over runs, and the half width of its 95 % interval if there are several."""
 
     mean: float
     half_width: float | None = None
@@ -158,7 +156,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Column:
-    """A numeric column: key in `Row.values`, heading, unit, decimals, factor on what is stored."""
+    """Numeric column: key in `Row.values`, heading, unit, decimals, factor on stored values."""
 
     key: str
     heading: str
@@ -168,7 +166,7 @@ class Column:
     source: str = "metrics"
 
     def text(self, row: "Row", separator: str = " ") -> str:
-        """Cell of a row: the mean, and ± half width after `separator`; published as printed."""
+        """Return the cell of a row: the mean, and ± half width after `separator`."""
         found = row.values.get(self.key)
         if found is None:
             return "–"
@@ -203,12 +201,12 @@ FURTHER = (
     Column("stopping_share", "share braking by itself", "", 3),
     Column("duration", "duration", "s", 1),
 )
-"""What the paper's table leaves out; "by the clock" is the distance to where the reference is."""
+"""Further columns; "by the clock" is the distance to the reference's position at the time."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the tables: a published row or an agent's runs of one setting and trajectory."""
+    """Row of the tables: published values, or an agent's runs of one setting and trajectory."""
 
     setting: Setting
     trajectory: str
@@ -223,7 +221,7 @@ class Row:
 
 
 def estimate(values: Sequence[float]) -> Estimate:
-    """Mean of one or more values; from two on with its interval, t_(0.975, n - 1) s / sqrt(n)."""
+    """Return the mean of values; for two or more its interval, t_(0.975, n - 1) s / sqrt(n)."""
     mean = float(np.mean(values))
     n = len(values)
     if n < 2:
@@ -254,7 +252,7 @@ def label_of(case: Result) -> str:
 
 
 def labels(cases: Iterable[Result]) -> list[str]:
-    """Labels of agents in the order of the registry, each once."""
+    """Return the labels of agents in the order of the registry, each once."""
     rank = _rank(agents.names())
     found = {label_of(case): str(case.get("agent")) for case in cases}
     return sorted(found, key=lambda label: (rank(found[label]), label))
@@ -267,10 +265,10 @@ def by_label(cases: Iterable[Result]) -> dict[str, list[Result]]:
 
 
 def current(cases: Iterable[Result]) -> list[Result]:
-    """Cases without those that a later one repeats: same case, run from other sources.
+    """Return the cases without those that a later one repeats with other sources.
 
     A case's id changes with the project's sources, so a folder that was resumed after a change
-    holds both; averaged, they would pass for two seeds.
+    holds both; averaged, they would count as two seeds.
     """
     names = [item.name for item in fields(Case)]
     latest = {repr([(name, case.get(name)) for name in names]): case for case in cases}
@@ -283,7 +281,7 @@ def _rank(known: Sequence[str]) -> Callable[[str], tuple[int, str]]:
 
 
 def ordered(cases: Iterable[Result]) -> list[Result]:
-    """Cases by setting, trajectory, agent and seed, independent of the order they were run in."""
+    """Sort cases by setting, trajectory, agent and seed."""
     path, agent = _rank(trajectories.names()), _rank(agents.names())
     return sorted(
         cases,
@@ -299,7 +297,7 @@ def ordered(cases: Iterable[Result]) -> list[Result]:
 
 
 def violated(metrics: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Constraints that an episode broke: name -> (largest excess, share of control periods)."""
+    """Return the violated constraints: name -> (largest excess, share of control periods)."""
     names = [key.removeprefix("excess_") for key in metrics if key.startswith("excess_")]
     return {
         name: (float(metrics[f"excess_{name}"]), float(metrics.get(f"violated_{name}", 0.0)))
@@ -309,7 +307,7 @@ def violated(metrics: Mapping[str, float]) -> dict[str, tuple[float, float]]:
 
 
 def _violation_words(episodes: Sequence[Mapping[str, float]]) -> str:
-    """Per constraint the largest excess over episodes and the mean share; "none" if all is kept."""
+    """Return each constraint's largest excess over episodes and mean share; "none" without any."""
     broken = [violated(metrics) for metrics in episodes]
     words = []
     for name in dict.fromkeys(name for one in broken for name in one):
@@ -324,14 +322,14 @@ def _violation_words(episodes: Sequence[Mapping[str, float]]) -> str:
 
 
 def _failure_words(cases: Sequence[Result]) -> str:
-    """Failed of all solves; "–" for agents that solve nothing."""
+    """Return failed and all solves; "–" for agents that solve nothing."""
     solves = sum(case["solver"].get("solves") or 0 for case in cases)
     failures = sum(case["solver"].get("failures") or 0 for case in cases)
     return f"{failures} of {solves}" if solves else "–"
 
 
 def _end_words(cases: Sequence[Result]) -> str:
-    """How episodes ended: the word alone if all did alike, counts otherwise."""
+    """Return how episodes ended: one end by name, several with their counts."""
     ends = Counter(
         str(case.get("end") or "?").replace("_", " ") if case.get("status") == "ok" else "failed"
         for case in cases
@@ -373,7 +371,7 @@ def _agent_row(setting: Setting, trajectory: str, label: str, cases: Sequence[Re
 
 
 def build_rows(cases: Iterable[Result]) -> list[Row]:
-    """All rows in order: per setting and trajectory the published one, then the agents'."""
+    """Return all rows: per setting and trajectory the published one, then the agents'."""
     groups: dict[tuple[Setting, str], dict[str, list[Result]]] = {}
     for case in ordered(current(cases)):
         key = setting_of(case), str(case.get("trajectory"))
@@ -390,7 +388,7 @@ def build_rows(cases: Iterable[Result]) -> list[Row]:
 
 
 def by_setting(rows: Iterable[Row]) -> dict[Setting, list[Row]]:
-    """Rows by their setting, in order."""
+    """Group rows by their setting, in order."""
     groups: dict[Setting, list[Row]] = {}
     for row in rows:
         groups.setdefault(row.setting, []).append(row)
@@ -398,7 +396,7 @@ def by_setting(rows: Iterable[Row]) -> dict[Setting, list[Row]]:
 
 
 def cases_by_setting(cases: Iterable[Result]) -> dict[Setting, list[Result]]:
-    """Cases by their setting, in order."""
+    """Group cases by their setting, in order."""
     groups: dict[Setting, list[Result]] = {}
     for case in cases:
         groups.setdefault(setting_of(case), []).append(case)

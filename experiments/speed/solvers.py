@@ -1,5 +1,6 @@
 """Sections of `predict`: NMPC solvers over horizon and batch, learned policies, worst case."""
 
+import itertools
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 import agents
 from agents.nmpc.problem import Status
+from experiments.run.rollout import steps
 from experiments.run.suites import LEARNED, PAPER_VEHICLES
 from experiments.speed.measure import (
     COLD_START,
@@ -83,14 +85,9 @@ def record(trajectory: str, horizon: int, windows: int, length: int) -> list[Win
     recorded = []
     for k in range(windows):
         arc_length = k / windows * path.length
-        observation, _ = env.reset(seed=0, options={**START, "arc_length": arc_length})
-        observations: list[Observations] = []
-        for step in range(length):
-            observations.append(observation)
-            action, _ = driver.predict(observation, episode_start=np.array([step == 0]))
-            observation, _, terminated, truncated, _ = env.step(action)
-            if terminated or truncated:
-                break
+        start = {**START, "arc_length": arc_length}
+        driven = itertools.islice(steps(env, driver, seed=0, options=start), length)
+        observations = [info["observation"] for _, info in driven]
         recorded.append(Window(trajectory, arc_length, np.stack(observations)))
     return recorded
 

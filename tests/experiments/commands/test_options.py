@@ -5,10 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from agents.weights import TrackingWeights, WeightSchedule
 from experiments.cli import main, parser
 from experiments.commands.options import agent_settings
 from experiments.run import tables
+from experiments.run.case import Case
 from experiments.run.store import ResultStore
+from trajectories import CurvatureBands
 
 WEIGHTS = {"Q": [1, 1, 20, 20], "S": [5, 5, 100, 100], "R": [0.01, 1]}
 
@@ -78,6 +81,33 @@ def test_names_are_given_in_either_number(
     for name in (plural, singular):
         options = parser([command]).parse_args([command, f"--{name.replace('_', '-')}", value])
         assert getattr(options, plural) == [value]
+
+
+def test_weights_and_schedules_are_typed_as_they_are_written(tmp_path: Path) -> None:
+    """For one agent of several, and told apart from the same agent with other weights."""
+    schedule = WeightSchedule(CurvatureBands(), (TrackingWeights(**WEIGHTS),) * 4).as_dict()
+    for number, weights in enumerate((WEIGHTS, schedule)):
+        command = [
+            "benchmark", "--agents", "lpv-nmpc", "lpv-nmpc-tuned", "--trajectory", "u-turn",
+            "--env", "time_limit=2.0", "--agent-set", f"lpv-nmpc:weights={json.dumps(weights)}",
+            "--resume", "--workers", "1", "--out", str(tmp_path / "out"),
+        ]  # fmt: skip
+        assert main(command) == 0
+        assert len(ResultStore(tmp_path / "out").cases()) == 2 + number
+    one, tuned, other = ResultStore(tmp_path / "out").cases()
+    assert {case["status"] for case in (one, tuned, other)} == {"ok"}
+    assert tuned["agent_settings"] == {}
+    assert one["agent_settings"] == {"weights": WEIGHTS}
+    # A schedule of equal sets is these weights.
+    assert one["metrics"] == other["metrics"] != tuned["metrics"]
+    labels = tables.labels([one, tuned, other])
+    assert "lpv-nmpc (weights={Q=[1, 1, 20, 20], R=[0.01, 1], S=[5, 5, 100, 100]})" in labels
+    assert len(labels) == 3
+
+
+def test_long_settings_are_no_names_of_files() -> None:
+    long = {"weights": {"provenance": "x" * 300}}
+    assert Case("lpv-nmpc", "T2", agent_settings=long).id != Case("lpv-nmpc", "T2").id
 
 
 def test_rows_of_one_agent_with_other_settings_are_told_apart(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from experiments.run import provenance
 from experiments.run import store as results
 from experiments.run.store import ResultStore
 from trajectories.fileio import write_atomically
@@ -139,8 +140,8 @@ def test_without_git_the_revision_is_unknown(monkeypatch):
     def missing(*arguments, **settings):
         raise FileNotFoundError("git")
 
-    monkeypatch.setattr(results.subprocess, "run", missing)
-    assert results.revision() == {"commit": None, "modified": None}
+    monkeypatch.setattr(provenance.subprocess, "run", missing)
+    assert provenance.revision() == {"commit": None, "modified": None}
 
 
 def test_an_atomic_write_replaces_the_whole_file_and_leaves_nothing_beside_it(tmp_path):
