@@ -149,7 +149,7 @@ class _Part:
         """Store the observations that agents are given, and the origins of their actions."""
         self.observations = np.array(observations, dtype=np.float64)
         if self._future is not None and self._delays is not None:
-            self._future.look(self.observations, starts, self._delays)
+            self._future.predict(self.observations, starts, self._delays)
         self.origins, self._base_memory = self._origins_of(
             self.observations, self._base_memory, starts
         )
@@ -178,7 +178,7 @@ class _Part:
         if self._future is not None and self._delays is not None:
             alone = self._future.memory(1)
             alone.commands[:] = self._delays.commands[row]
-            self._future.look(observations, np.zeros(1, dtype=np.bool_), alone)
+            self._future.predict(observations, np.zeros(1, dtype=np.bool_), alone)
         # The row's own memory belongs to the next episode already.
         fresh = None if self._base is None else self._base.new_memory().memory
         origins, _ = self._origins_of(observations, fresh, None)
@@ -191,7 +191,7 @@ class _Part:
         actions = self.origins + scaling.centre + scaling.half * np.clip(outputs, -1.0, 1.0)
         sent: NDArray[np.float32] = np.clip(actions.astype(np.float32), self._low, self._high)
         if self._future is not None and self._delays is not None:
-            self._future.note(self._delays, sent)
+            self._future.record(self._delays, sent)
         return sent
 
 

@@ -1,13 +1,13 @@
-"""Primal-dual interior-point method for the NMPC's quadratic program: its steps, compiled.
+"""Steps of a primal-dual interior-point method for the NMPC's QP, compiled.
 
 Mehrotra's predictor and corrector on Riccati recursions (`riccati`), from an infeasible start.
-A slack s costs linear s + 1/2 quadratic s^2 and is eliminated by hand: with w = lam / t and b the
-multiplier that a step of no length would give, its step is
+A slack s costs linear s + 1/2 quadratic s^2 and is eliminated analytically: with w = lam / t and b
+the multiplier after a step of length zero, its step is
 
     ds = (sum b - linear - quadratic s - sum w dgap) / (quadratic + sum w)
 
-over its pairs and its own bound. What the Riccati recursion sees is then a Hessian and a gradient
-by stage. Pairs and arrays are those of `layout`.
+over its pairs and its own bound. Each stage then adds a Hessian and a gradient to the Riccati
+recursion. Pairs and arrays are described in `layout`.
 """
 
 from typing import Any
@@ -22,14 +22,14 @@ Array = NDArray[Any]
 Float = Any
 
 START_BARRIER = 300.0
-"""Product t lam at the start."""
+"""Initial product t lam."""
 START_DISTANCE = 1.0
-"""Least t at the start, as a share of the range between a pair's bounds."""
+"""Least initial t, as a share of the range between a pair's bounds."""
 
 
 @compiled_internal
-def start(lanes: Array, constants: Array) -> Float:
-    """Start of all pairs: products at START_BARRIER, t at least some share of its range.
+def initialise(lanes: Array, constants: Array) -> Float:
+    """Initialise all pairs: products at START_BARRIER, t at least a share of its range.
 
     Returns the largest residual t - gap.
     """
@@ -61,11 +61,11 @@ def start(lanes: Array, constants: Array) -> Float:
 
 
 @compiled_internal
-def weigh(lanes: Array, constants: Array) -> None:
-    """Fill what the pairs add to the Hessian, and no corrections yet.
+def fill_hessian(lanes: Array, constants: Array) -> None:
+    """Fill the Hessian terms of the pairs, and clear the corrections.
 
-    w1 + w2 - (w1 - w2)^2 / (quadratic + sum w) and its like are taken without differences of large
-    numbers.
+    w1 + w2 - (w1 - w2)^2 / (quadratic + sum w) and the like are computed without differences of
+    large numbers.
     """
     n = lanes.shape[1]
     for k in range(L.PAIRS):
@@ -98,8 +98,8 @@ def weigh(lanes: Array, constants: Array) -> None:
 
 
 @compiled_internal
-def press(lanes: Array, constants: Array, share: Float) -> None:
-    """Fill what the pairs, and their corrections in the rows of dt, add to the gradient."""
+def fill_gradient(lanes: Array, constants: Array, share: Float) -> None:
+    """Fill the gradient terms of the pairs and of their corrections in the rows of dt."""
     n = lanes.shape[1]
     for k in range(L.PAIRS):
         force, correction = lanes[L.FORCE + k], lanes[L.DT + k]
@@ -128,10 +128,10 @@ def press(lanes: Array, constants: Array, share: Float) -> None:
 
 
 @compiled_internal
-def expand(stages: Array, lanes: Array, constants: Array, share: Float) -> Float:
-    """Steps of all pairs from the Riccati step; returns the step length that keeps them positive.
+def expand_step(stages: Array, lanes: Array, constants: Array, share: Float) -> Float:
+    """Compute the steps of all pairs from the Riccati step.
 
-    The length is at most 1 and goes all the way to the nearest bound.
+    Returns the step length at which the first pair reaches its bound.
     """
     n = lanes.shape[1]
     ratio = constants[L.RATIO]
@@ -167,7 +167,7 @@ def expand(stages: Array, lanes: Array, constants: Array, share: Float) -> Float
         lam, step, dlam, inverse = lanes[L.LAM + k], dt[k], lanes[L.DLAM + k], lanes[L.INVERSE + k]
         weight, force, residual = w[k], lanes[L.FORCE + k], lanes[L.RESIDUAL + k]
         for i in range(n):
-            # force holds w share residual, which dt has taken off again.
+            # force contains w share residual, which dt has subtracted again.
             dlam[i] = force[i] - weight[i] * (step[i] + share * residual[i]) - lam[i]
             worst = max(-step[i] * inverse[i], -dlam[i] / lam[i])
             longest[i] = max(longest[i], worst)
@@ -199,8 +199,8 @@ def centre(lanes: Array, length: Float, mu: Float) -> None:
 
 
 @compiled_internal
-def update(lanes: Array, length: Float) -> Float:
-    """Take a step of all pairs; returns the mean product t lam."""
+def take_step(lanes: Array, length: Float) -> Float:
+    """Take a step of all pairs; return the mean product t lam."""
     product, n = lanes[L.LONGEST], lanes.shape[1]
     for i in range(n):
         product[i] = 0.0

@@ -1,7 +1,6 @@
-"""Weights in use from period to period, compiled: the band of a preview, and how far a switch goes.
+"""Weights in use from period to period, compiled: band of the preview, blending and slew limit.
 
-The one place in which a schedule is followed: by agents one vehicle at a time, by batches, and by
-closed loops in compiled code.
+Agents, batches and compiled closed loops all follow their schedules here.
 """
 
 import math
@@ -18,28 +17,29 @@ from trajectories.compilation import compiled, compiled_internal
 Array = NDArray[Any]
 
 WEIGHTS = 10
-"""Q, S, R in one row."""
+"""Size of a set of weights: Q, S, R."""
+# Rules, (3 + bands - 1,): the bands' hysteresis, half width of blending, largest factor by which a
+# weight changes in a period, and the bands' thresholds from there on.
 HYSTERESIS, BLEND, LARGEST_FACTOR, THRESHOLDS = range(4)
-"""Rules, (3 + bands - 1,): the bands' hysteresis, half width of blending, the factor by which a
-weight may change in a period, and the bands' thresholds from there on."""
 NO_BAND = -1
+"""Band of a vehicle before its first observation."""
 
 
 def rules_of(bands: CurvatureBands, blend: float, slew: float, period: float) -> Array:
-    """Pack what `choose_weights` goes by; `slew` in nepers a second, `period` in s."""
+    """Pack the rules of `choose_weights`; `slew` in 1/s, `period` in s."""
     with np.errstate(over="ignore"):
         factor = float(np.exp(slew * period))
     return np.array([bands.hysteresis, blend, factor, *bands.thresholds])
 
 
 def one_set(weights: Array) -> tuple[Array, Array]:
-    """Tables and rules of weights that no band chooses: (10,) or (n, 10)."""
+    """Return tables and rules of fixed weights, (10,) or (n, 10)."""
     tables = np.array(np.atleast_2d(weights), dtype=np.float64)[:, None, :]
     return tables, np.array([0.0, 0.0, math.inf])
 
 
 def of_schedule(schedule: WeightSchedule, period: float) -> tuple[Array, Array]:
-    """Tables (1, bands, 10) and rules of a schedule, at a control period (s)."""
+    """Return tables (1, bands, 10) and rules of a schedule, for a control period (s)."""
     sets = [weights.clipped().as_array() for weights in schedule.weights]
     slew = math.inf if schedule.slew is None else schedule.slew
     return np.array(sets)[None], rules_of(schedule.bands, schedule.blend, slew, period)
@@ -51,7 +51,7 @@ def sharpest(observation: Array, steps: int) -> Any:
     largest = 0.0
     for k in range(steps):
         value = abs(observation[PREVIEW_START + k])
-        if value > largest or math.isnan(value):  # and nothing is larger than NaN
+        if value > largest or math.isnan(value):  # NaN is kept: no value is larger
             largest = value
     return largest
 
@@ -78,7 +78,7 @@ def band_of(curvature: Any, current: int, rules: Array) -> int:
 
 @compiled_internal
 def update_band(observation: Array, steps: int, rules: Array, bands: Array, row: int) -> None:
-    """Bring `bands[row]` up to date with a preview; one that is not finite changes nothing."""
+    """Update `bands[row]` by a preview, unless that is not finite."""
     curvature = sharpest(observation, steps)
     if math.isfinite(curvature):
         bands[row] = band_of(curvature, bands[row], rules)
@@ -88,10 +88,10 @@ def update_band(observation: Array, steps: int, rules: Array, bands: Array, row:
 def choose_weights(
     observation: Array, steps: int, tables: Array, rules: Array, bands: Array, row: int, used: Array
 ) -> None:
-    """Bring the weights in use, (10,), towards those of the preview's band, in place.
+    """Move the weights in use, (10,), towards those of the preview's band, in place.
 
-    `tables` is (bands, 10); `used` of zeros is that of an episode that begins. Within the bounds of
-    weights, whatever the table has. A preview that is not finite changes nothing.
+    `tables` is (bands, 10), clipped here to the bounds of weights. `used` is zero where an episode
+    begins: the slew limit does not apply then. A preview that is not finite changes nothing.
     """
     curvature = sharpest(observation, steps)
     first = used[0] == 0.0
@@ -132,12 +132,12 @@ def choose_all(
 
 
 class Switching:
-    """Weights in use of n vehicles that follow fixed weights or a schedule.
+    """Fixed weights or a schedule, as n vehicles follow them.
 
     Parameters
     ----------
     weights
-        What is followed.
+        The weights or the schedule.
     period
         Control period, s.
     """
@@ -150,5 +150,5 @@ class Switching:
         )
 
     def choose(self, rows: Array, steps: int, bands: Array, used: Array) -> None:
-        """Bring `used` (n, 10) and `bands` (n,) up to date with observations (n, size)."""
+        """Update `used` (n, 10) and `bands` (n,) by observations (n, size)."""
         choose_all(rows, steps, self.tables, self.rules, bands, used)

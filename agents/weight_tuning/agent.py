@@ -15,7 +15,7 @@ from agents.nmpc.rti_agent import RtiNmpc
 from agents.nmpc.settings import passes_settings
 from agents.reference import NODE
 from agents.weight_tuning.decision import NO_POLICY, Decider
-from agents.weight_tuning.history import REJECTED
+from agents.weight_tuning.features import REJECTED
 from agents.weight_tuning.loop_kernels import finish_rows, prepare_rows
 from agents.weight_tuning.loop_memory import LoopMemory, LoopRow
 from agents.weight_tuning.policy import WeightPolicy, load

@@ -8,8 +8,17 @@ from numpy.typing import NDArray
 from agents.learned.files import Layer
 from agents.learned.network import ACTIVATION, OUTPUTS, TANH, activate, dense, pack_layers
 from agents.weight_tuning.choice import WeightChoice, weights_for, weights_for_all
-from agents.weight_tuning.features import SCALES, fill_all, fill_features, size
-from agents.weight_tuning.history import CLOCK, DECIDED, FAILURES, ITERATIONS, REJECTED
+from agents.weight_tuning.features import (
+    CLOCK,
+    DECIDED,
+    FAILURES,
+    ITERATIONS,
+    REJECTED,
+    SCALES,
+    fill_all,
+    fill_features,
+    size,
+)
 from agents.weight_tuning.loop_memory import LoopMemory
 from trajectories.compilation import compiled_internal
 

@@ -1,4 +1,4 @@
-"""`lpv_track_env/WeightTuning-v0`: an NMPC drives, the action chooses its weights."""
+"""`lpv_track_env/WeightTuning-v0`: an NMPC drives, and the action chooses its weights."""
 
 from typing import Any
 
@@ -19,51 +19,51 @@ Array = NDArray[Any]
 class WeightTuningEnv(gymnasium.Env[NDArray[np.float32], Any]):
     """A vehicle follows a reference path with `lpv-nmpc`; an action chooses the NMPC's Q and S.
 
-    One step drives a window of control periods (0.4 s), or up to where the preview enters another
-    band of curvature, with the weights that the action chooses for the band at hand.
+    One step drives a window of control periods (0.4 s), or until the preview enters another band of
+    curvature, with the weights that the action chooses for the present band.
 
     ## Action space
 
-    Box in [-1, 1], float32: logarithms of what the base's Q and S of this band are multiplied by,
-    in units of ln(span); an entry each for speed, heading and position ("joint"), for these in Q
-    and then in S ("stages"), or for each of Q and S on [vx, psi, X, Y] ("all"). With a catalogue,
-    Discrete: which of its sets is taken. R stays: only ratios matter.
+    Box in [-1, 1], float32: logarithms of the factors on the base's Q and S of this band, in units
+    of ln(span); one entry each for speed, heading and position ("joint"), for these in Q and then
+    in S ("stages"), or for each of Q and S on [vx, psi, X, Y] ("all"). With a catalogue, Discrete:
+    the index of one of its sets. R stays as it is: only ratios matter.
 
     Weights move at the base's slew limit, within the bounds of `TrackingWeights`; the NMPC keeps
-    its warm start. Entries beyond [-1, 1] are clipped; an action with one that is not finite is
-    rejected, and the band keeps the set that was last chosen for it, at first the base's. Both are
-    counted in infos and the drive goes on. A wrong shape or type, or an index that is not in the
-    catalogue, is a ValueError and leaves the episode untouched.
+    its warm start. Entries beyond [-1, 1] are clipped. An action with an entry that is not finite
+    is rejected: the band keeps the set last chosen for it, at first the base's. Infos count both,
+    and the drive goes on. A wrong shape or type, or an index that is not in the catalogue, raises a
+    ValueError and leaves the episode unchanged.
 
     ## Observation space
 
-    Box of features, float32: `agents.weight_tuning.features` names every entry and its scale. They
-    are made of what the agent itself sees and does: errors, preview, band, weights in use, solver,
-    and mean squares of errors, surprises and lags over 0.4 s and 4 s. The truth is not among them.
+    Box of features, float32: `agents.weight_tuning.features` describes every entry and its scale.
+    They use what the agent itself observes and does, never the true state: errors, preview, band,
+    weights in use, solver, and mean squares of errors, surprises and lags over 0.4 s and 4 s.
 
     ## Reward
 
-    Minus what the window adds to its drive's score, to first order (`marginal_parts` of
-    `agents.weight_tuning.score`), times its share of a whole window; of the truth. A drive that
-    fails ends with minus 250 besides: ten windows of the worst. A window of a good drive costs 1 to
-    3 under "realtime", so that is dearer than to drive on for discount factors up to 0.99, and not
-    for those close to 1 on a long path.
+    Minus the window's contribution to the score of its drive, to first order (`marginal_parts` of
+    `agents.weight_tuning.score`, from true errors), times its share of a whole window. A failed
+    drive ends with a further -250: ten windows of the worst score. A window of a good drive costs 1
+    to 3 under "realtime", so failing is worse than driving on for discount factors up to 0.99, but
+    not for those close to 1 on a long path.
 
     ## Episode
 
     As in `PathTrackingEnv`: terminated at the path's end, off the road or turned around; truncated
-    at the time limit. Where a computer misses its deadlines a window may end while it is busy: what
-    is chosen then holds from its next solve on.
+    at the time limit. If the computer misses its deadlines, a window may end while it is busy: the
+    weights chosen then apply from its next solve on.
 
     ## Infos
 
-    `parts` (5,) of the window; `steps`, `solves`, `failures` of the window; `band` that the next
-    action is for; `weights` (10,) in use, zeros before the first window; how many actions of the
-    episode were `rejected` and `clipped`; at its end `end` and its `score`.
+    `parts` (5,) of the window's score; its `steps`, `solves` and `failures`; the `band` of the next
+    action; `weights` (10,) in use, zeros before the first window; the numbers of `rejected` and
+    `clipped` actions in the episode; and where it ended, its `end` and `score`.
 
     ## Arguments
 
-    Those of `PathTrackingEnv` but its reward's weights, and
+    Those of `PathTrackingEnv` except its reward's weights, and
 
     choice
         `agents.weight_tuning.choice.WeightChoice`: base, bands, directions, span or catalogue,
@@ -104,7 +104,7 @@ class WeightTuningEnv(gymnasium.Env[NDArray[np.float32], Any]):
         return observations[0], _single(infos)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Drive a window with the weights that are chosen; see the class."""
+        """Drive a window with the chosen weights; see the class."""
         if not self.drives.loop.running[0]:
             raise gymnasium.error.ResetNeeded("the episode has ended: call reset() before step()")
         actions: Any = [action]
@@ -120,12 +120,12 @@ class WeightTuningEnv(gymnasium.Env[NDArray[np.float32], Any]):
         return None if frames is None else frames[0]
 
     def close(self) -> None:
-        """Free what drawing took."""
+        """Close the renderer."""
         self.drives.close()
 
 
 def _single(infos: dict[str, Any]) -> dict[str, Any]:
-    """Infos of a vector environment of one, as a single environment's."""
+    """Convert the infos of a vector environment of size 1 to those of a single environment."""
     single = {}
     for name, values in infos.items():
         if name.startswith("_"):

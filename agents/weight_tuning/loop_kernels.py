@@ -6,14 +6,14 @@ from typing import Any, NamedTuple
 import numba
 from numpy.typing import NDArray
 
-from agents.delay_kernels import look_ahead
+from agents.delay import predict_observation
 from agents.nmpc import rti
 from agents.nmpc.qp import CODE, INNER, SUCCESS
 from agents.nmpc.rti import NmpcArrays
 from agents.nmpc.schedule import NO_BAND, choose_weights, update_band
-from agents.weight_tuning import history
+from agents.weight_tuning import features
 from agents.weight_tuning.decision import PolicyArrays, decide_if_due
-from agents.weight_tuning.history import end_period, update_history
+from agents.weight_tuning.features import end_period, update_history
 from agents.weight_tuning.loop_memory import MemoryArrays, WeightArrays
 from lpv_track_env import kernels as k
 from lpv_track_env.conditions import layout as conditions_layout
@@ -104,7 +104,7 @@ def prepare_observation(
     if delays.shape[0] > 0:
         foot_point[0] = foot_point[1] = foot_point[2] = 0.0
         if math.isfinite(total):
-            look_ahead(shown, commands, delays, nodes, foot_point)
+            predict_observation(shown, commands, delays, nodes, foot_point)
 
 
 @compiled_internal
@@ -122,7 +122,7 @@ def take_in(
 ) -> None:  # fmt: skip
     """Take a vehicle's observation in, once a period: NMPC's observation, band and history."""
     own = memory.history[row]
-    if own[history.TAKEN_IN] > 0.0:
+    if own[features.TAKEN_IN] > 0.0:
         return
     shown = memory.nmpc_observations[row]
     prepare_observation(
@@ -165,9 +165,9 @@ def update_weights(
 @compiled_internal
 def count_solve(own: Array, stats: Array) -> None:
     """Count a solve's iterations and its failure in a vehicle's history."""
-    own[history.ITERATIONS] += stats[INNER]
+    own[features.ITERATIONS] += stats[INNER]
     if stats[CODE] != SUCCESS:
-        own[history.FAILURES] += 1.0
+        own[features.FAILURES] += 1.0
 
 
 @compiled_internal

@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.delay import NearFuture
-from agents.delay_kernels import FOOT
+from agents.delay import FOOT, NearFuture
 from agents.nmpc.rti_agent import RtiMemory
-from agents.weight_tuning.history import AGE, CLOCK, HISTORY, TAKEN_IN
+from agents.weight_tuning.features import AGE, CLOCK, HISTORY, TAKEN_IN
 from lpv_track_env.observation import ACCELERATION, STEERING_ANGLE
 
 Array = NDArray[Any]
@@ -26,7 +25,7 @@ class MemoryArrays(NamedTuple):
     foot_points: Array
     """Pose of the predicted foot point in the frame of the observed one, (n, FOOT)."""
     history: Array
-    """Driving history, (n, HISTORY), see `agents.weight_tuning.history`."""
+    """Driving history, (n, HISTORY), see `agents.weight_tuning.features`."""
     delays: Array
     """Settings of the delay compensation (`agents.delay`), of size 0 without it."""
 

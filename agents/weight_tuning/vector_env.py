@@ -1,4 +1,4 @@
-"""`WeightTuning-v0`, many at once: vehicles with an NMPC each, whose weights are chosen."""
+"""Vector environment of `WeightTuning-v0`: many vehicles, each with an NMPC."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -32,26 +32,26 @@ Infos = dict[str, Any]
 NOT_TAKEN = ("reward_weights", "plant", "render_colour")
 """Arguments of `PathTrackingEnv` that the weight-tuning environments do not take."""
 END_WINDOWS = 10.0
-"""Windows of the worst score that the end of a drive that fails costs."""
+"""Cost of a failed drive, in windows of the worst score."""
 
 
 class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
-    """`num_envs` vehicles follow paths with `lpv-nmpc`; an action chooses its weights.
+    """`num_envs` vehicles follow paths with `lpv-nmpc`; actions choose its weights.
 
     `gymnasium.make_vec("lpv_track_env/WeightTuning-v0", num_envs=n,
     vectorization_mode="vector_entry_point", ...)` makes one. Plant, estimator, delay compensation
     and NMPC run in compiled code; see `WeightTuningEnv` for actions, observations and rewards.
-    Environment i of `reset(seed=s)` is a single environment of `reset(seed=s + i)`.
+    After `reset(seed=s)` environment i equals a single environment after `reset(seed=s + i)`.
 
     ## Autoreset, infos
 
-    As in `PathTrackingVectorEnv`: `NEXT_STEP` (default), `SAME_STEP`, `DISABLED`, and infos as
-    Gymnasium's `SyncVectorEnv` gathers them in each.
+    As in `PathTrackingVectorEnv`: modes `NEXT_STEP` (default), `SAME_STEP` and `DISABLED`, with
+    infos in the form of Gymnasium's `SyncVectorEnv`.
 
     ## Arguments
 
     Those of `WeightTuningEnv`, and `num_envs`, `autoreset_mode`, `threads`; `trajectory` and
-    `vehicle` may be sequences, of which every episode draws one each. Every NMPC's model is the
+    `vehicle` may be sequences, from which every episode draws one. The model of every NMPC is the
     first vehicle, whichever it drives.
     """
 
@@ -100,34 +100,34 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
 
     @property
     def solves(self) -> int:
-        """Solves of all environments since they were made: the budget of whoever tunes."""
+        """Solves of all environments since they were made: the budget of tuning."""
         return self._solves
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Infos | None = None
     ) -> tuple[Array, Infos]:
-        """Begin episodes: of all environments, or of those that `options["reset_mask"]` marks.
+        """Begin episodes in all environments, or in those that `options["reset_mask"]` marks.
 
         Other options are those of `PathTrackingEnv`, errors those of `PathTrackingVectorEnv`.
         """
         mask = checked_mask((options or {}).get("reset_mask"), self.num_envs)
         seeds: Any = seed
         self.loop.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})
-        # All is checked: from here on the last episodes are gone.
+        # All arguments have been checked: the previous episodes end here.
         if isinstance(seed, int):
             super().reset(seed=seed)
         self._begin(mask)
         return self._observe(), self._infos(mask)
 
     def _begin(self, mask: Array) -> None:
-        """Forget the episodes that a mask marks, and see the first observation of the next."""
+        """Clear the episodes that a mask marks, and take in the first observations of the next."""
         self._sums[:, mask] = 0.0
         self._ended[mask] = False
         self._rejected[mask] = self._clipped[mask] = 0
         self.loop.take_in(mask)
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
-        """Drive on with the weights that are chosen, until the window or the band ends."""
+        """Drive on with the chosen weights, until the window or the band ends."""
         self._check_order()
         self._choose(checked_actions(actions, self.choice, self.num_envs))
         begins = self._ended
@@ -135,21 +135,21 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         ends = self.drives.arrays.ends
         self._ended = ends != k.RUNNING
         ended = self._ended & ~begins
-        # What is seen where an episode ends is what would be seen if it went on.
+        # The last observation of an episode has the same features as if the episode went on.
         self.loop.take_in(ended)
         self._add(tally)
         rewards = self._rewards(tally, ended)
         truncated = ended & (ends == k.TIME_LIMIT)
         infos: Infos = {}
-        again, told = begins, ended
+        again, reported = begins, ended
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
             infos = self._final(ended, tally)
-            again, told = ended, np.zeros_like(ended)
+            again, reported = ended, np.zeros_like(ended)
             tally = Tally(*(np.array(tally) * ~again))
         if self.autoreset_mode is not AutoresetMode.DISABLED and again.any():
             self.loop.reset(options={"reset_mask": again})
             self._begin(again)
-        infos.update(self._infos(np.ones_like(ended), tally, told))
+        infos.update(self._infos(np.ones_like(ended), tally, reported))
         return self._observe(), rewards, ended & ~truncated, truncated, infos
 
     def _check_order(self) -> None:
@@ -162,12 +162,12 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
             )
 
     def _choose(self, actions: Array) -> None:
-        """Write what actions (n, entries) mean into the tables of running vehicles."""
+        """Write the weights that actions (n, entries) choose to the tables of running vehicles."""
         memory, running = self.loop.memory, ~self._ended
-        refused = self._decider.choose(actions, running, memory.nmpc.bands, memory)
-        self._rejected += refused
+        rejected = self._decider.choose(actions, running, memory.nmpc.bands, memory)
+        self._rejected += rejected
         beyond = (np.abs(actions) > 1.0).any(axis=1)
-        self._clipped += running & beyond & ~refused
+        self._clipped += running & beyond & ~rejected
 
     def _add(self, tally: Tally) -> None:
         """Add a window to the episodes' tallies."""
@@ -190,9 +190,9 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         return self._decider.observe(self.drives.arrays.observations, self.loop.memory)
 
     def _infos(self, mask: Array, tally: Tally | None = None, ended: Array | None = None) -> Infos:
-        """Infos of a window for the environments that `mask` (n,) marks, zeros for the others.
+        """Return a window's infos for the environments that `mask` (n,) marks, else zeros.
 
-        Those that `ended` (n,) marks have an `end` and a `score`, too.
+        Environments that `ended` (n,) marks have an `end` and a `score`, too.
         """
         memory = self.loop.memory
         driven = Tally(*np.zeros_like(self._sums)) if tally is None else tally
@@ -215,7 +215,7 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         return infos
 
     def _final(self, ended: Array, tally: Tally) -> Infos:
-        """`final_obs` and `final_info` of the episodes that have `ended` (n,)."""
+        """Return `final_obs` and `final_info` of the episodes that have `ended` (n,)."""
         observations, last = self._observe(), np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended).tolist():
             last[i] = observations[i]
@@ -226,11 +226,11 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Draw every environment, as `PathTrackingVectorEnv` does, and the weights in use."""
-        # Of zeros before the first window of an episode.
+        # The weights are zeros before the first window of an episode.
         return self.drives.render(
             [in_words(row) if row.any() else {} for row in self.loop.memory.nmpc.weights]
         )
 
     def close_extras(self, **_: Any) -> None:
-        """Free what drawing took."""
+        """Close the renderers."""
         self.drives.close()

@@ -112,7 +112,7 @@ class ByHand:
         if future is not None:
             memory = copy.deepcopy(self.agent._memory)
             starts = np.array([memory is None])
-            future.look(seen, starts, future.memory(1) if memory is None else memory)
+            future.predict(seen, starts, future.memory(1) if memory is None else memory)
         preview = self.env.layout.unpack(seen[0]).preview_curvature[: self.horizon]
         return self.choice.bands.select(preview, self.band)
 

@@ -11,16 +11,18 @@ from numpy.typing import NDArray
 import trajectories
 from agents.weight_tuning import features
 from agents.weight_tuning.env import WeightTuningEnv
-from agents.weight_tuning.features import LIMIT, SCALES, fill_features
-from agents.weight_tuning.history import (
+from agents.weight_tuning.features import (
     AGE,
     HISTORY,
     LAST,
+    LIMIT,
     QUICK,
+    SCALES,
     SEEN,
     SLOW,
     STATISTICS,
     end_period,
+    fill_features,
     update_history,
 )  # fmt: skip
 from agents.weights import HIGHEST, LOWEST
