@@ -164,14 +164,19 @@ class _NlpSolver(ABC):
     """A solver of the problem as an NLP, whose variables are N groups of `GROUP`."""
 
     GROUP: ClassVar[int]
-    INPUT: ClassVar[slice]
     STATE: ClassVar[slice]
+    INPUT: ClassVar[tuple[slice, ...]]
+    """Places of the input in a group."""
     SLACK: ClassVar[list[int]]
-    """Columns of the slacks on vx, vy, vx' in a group."""
+    """Places of the slacks on vx, vy, vx' in a group."""
+    WARM: ClassVar[dict[str, str]]
+    """Results of a solve that start the next one, by the name of its argument."""
 
     problem: NmpcProblem
     _model: ca.Function
     _bounds: dict[str, Array]
+    _cold_solver: ca.Function
+    _warm_solver: ca.Function
 
     def solve(
         self, state: Array, last_input: Array, reference: Array, weights: Array, warm: Any = None
@@ -182,7 +187,10 @@ class _NlpSolver(ABC):
         one period here. Never raises: the status reports failures.
         """
         began = time.perf_counter()
-        solver, guess = self._start(state, last_input, warm)
+        if warm is None:
+            guess, solver = {"x0": self._cold_guess(state, last_input)}, self._cold_solver
+        else:
+            guess, solver = self._shifted(warm), self._warm_solver
         parameters = np.concatenate([state, last_input, reference.ravel(), weights])
         return self._run(solver, guess, parameters, began)
 
@@ -204,38 +212,29 @@ class _NlpSolver(ABC):
         if status is Status.NAN or not (np.isfinite(groups).all() and np.isfinite(cost)):
             return Solution(Status.NAN, None, None, None, np.nan, iterations, seconds), None
         states = np.vstack([parameters[:STATES], groups[:, self.STATE]])
-        inputs, slack = groups[:, self.INPUT].copy(), groups[:, self.SLACK]
+        inputs, slack = groups[:, self.INPUT[0]].copy(), groups[:, self.SLACK]
         plan = Solution(status, inputs, states, slack, cost, iterations, seconds)
-        return plan, self._warm(result)
-
-    def _cold(self, state: Array, last_input: Array) -> Array:
-        """Guess without a plan: the motion of the model under the input in force, held."""
-        low, high = self.problem.input_bounds
-        held = last_input.clip(low, high)
-        guess = np.zeros((self.problem.horizon, self.GROUP))
-        guess[:, self.INPUT] = held
-        for row in guess:
-            row[self.STATE] = state = np.asarray(self._model(state, held)).ravel()
-        return guess if np.isfinite(guess).all() else np.zeros_like(guess)
-
-    @abstractmethod
-    def _start(
-        self, state: Array, last_input: Array, warm: Any
-    ) -> tuple[ca.Function, dict[str, Array]]:
-        """Choose the solver, and its guess."""
+        return plan, {name: np.asarray(result[of]).ravel() for name, of in self.WARM.items()}
 
     @abstractmethod
     def _status(self, statistics: dict[str, Any]) -> Status:
         """Status of a solve by CasADi's statistics."""
 
-    @abstractmethod
-    def _warm(self, result: dict[str, Any]) -> Any:
-        """Warm start for the next solve."""
+    def _cold_guess(self, state: Array, last_input: Array) -> Array:
+        """Guess without a plan: the motion of the model under the input in force, held."""
+        low, high = self.problem.input_bounds
+        held = last_input.clip(low, high)
+        guess = np.zeros((self.problem.horizon, self.GROUP))
+        for columns in self.INPUT:
+            guess[:, columns] = held
+        for row in guess:
+            row[self.STATE] = state = np.asarray(self._model(state, held)).ravel()
+        return (guess if np.isfinite(guess).all() else np.zeros_like(guess)).ravel()
 
-
-def _shift(values: Array) -> Array:
-    """Shift the rows of an array by one; the last one is repeated."""
-    return np.vstack([values[1:], values[-1:]])
+    def _shifted(self, warm: dict[str, Array]) -> dict[str, Array]:
+        """Shift a warm start by one stage; the last one is repeated."""
+        stages = {name: values.reshape(self.problem.horizon, -1) for name, values in warm.items()}
+        return {name: np.vstack([rows[1:], rows[-1:]]).ravel() for name, rows in stages.items()}
 
 
 class IpoptSolver(_NlpSolver):
@@ -254,8 +253,10 @@ class IpoptSolver(_NlpSolver):
     """
 
     GROUP = INPUTS + SOFT + STATES
-    INPUT, STATE = slice(0, INPUTS), slice(INPUTS + SOFT, GROUP)
+    STATE = slice(INPUTS + SOFT, GROUP)
+    INPUT = (slice(0, INPUTS),)
     SLACK: ClassVar[list[int]] = [2, 3, 4]
+    WARM: ClassVar[dict[str, str]] = {"x0": "x", "lam_x0": "lam_x", "lam_g0": "lam_g"}
 
     def __init__(
         self, problem: NmpcProblem, *, tolerance: float = 1e-6, max_seconds: float = 20.0
@@ -321,22 +322,8 @@ class IpoptSolver(_NlpSolver):
         parameters = np.concatenate([state, last_input, reference.ravel(), weights])
         return self._run(self._warm_solver, guess, parameters, began)[0]
 
-    def _start(
-        self, state: Array, last_input: Array, warm: dict[str, Array] | None
-    ) -> tuple[ca.Function, dict[str, Array]]:
-        if warm is None:
-            return self._cold_solver, {"x0": self._cold(state, last_input).ravel()}
-        n = self.problem.horizon
-        shifted = {name: _shift(values.reshape(n, -1)).ravel() for name, values in warm.items()}
-        return self._warm_solver, shifted
-
     def _status(self, statistics: dict[str, Any]) -> Status:
         return IPOPT_STATUS.get(statistics["return_status"], Status.QP_FAILURE)
-
-    def _warm(self, result: dict[str, Any]) -> dict[str, Array]:
-        """Primal and dual variables, stage by stage."""
-        names = {"x0": "x", "lam_x0": "lam_x", "lam_g0": "lam_g"}
-        return {guess: np.asarray(result[name]).ravel() for guess, name in names.items()}
 
 
 class FatropSolver(_NlpSolver):
@@ -371,9 +358,10 @@ class FatropSolver(_NlpSolver):
     """
 
     GROUP = INPUTS + SOFT + STATES + INPUTS
-    INPUT, STATE = slice(0, INPUTS), slice(INPUTS + 1, INPUTS + 1 + STATES)
-    APPLIED = slice(STATE.stop, STATE.stop + INPUTS)
-    SLACK: ClassVar[list[int]] = [APPLIED.stop, APPLIED.stop + 1, INPUTS]
+    STATE = slice(INPUTS + 1, INPUTS + 1 + STATES)
+    SLACK: ClassVar[list[int]] = [GROUP - 2, GROUP - 1, INPUTS]
+    INPUT = (slice(0, INPUTS), slice(STATE.stop, STATE.stop + INPUTS))
+    WARM: ClassVar[dict[str, str]] = {"x0": "x"}
 
     def __init__(self, problem: NmpcProblem, *, tolerance: float = 1e-6) -> None:
         if not ca.has_nlpsol("fatrop"):
@@ -401,7 +389,8 @@ class FatropSolver(_NlpSolver):
             "lbg": _tightened(nlp.lower_rows, 1.0, equal=nlp.equal),
             "ubg": _tightened(nlp.upper_rows, -1.0, equal=nlp.equal),
         }
-        self._solver = ca.nlpsol("nmpc", "fatrop", nlp.as_dict(), options)
+        self._cold_solver = ca.nlpsol("nmpc", "fatrop", nlp.as_dict(), options)
+        self._warm_solver = self._cold_solver
 
     def _transcribed(self) -> _Nlp:
         problem, n = self.problem, self.problem.horizon
@@ -434,24 +423,11 @@ class FatropSolver(_NlpSolver):
                 nlp.limit_velocity(here, sigma)
         return nlp
 
-    def _start(
-        self, state: Array, last_input: Array, warm: Array | None
-    ) -> tuple[ca.Function, dict[str, Array]]:
-        if warm is not None:
-            return self._solver, {"x0": _shift(warm).ravel()}
-        guess = self._cold(state, last_input)
-        guess[:, self.APPLIED] = guess[:, self.INPUT]
-        return self._solver, {"x0": guess.ravel()}
-
     def _status(self, statistics: dict[str, Any]) -> Status:
         if statistics["success"]:
             return Status.SUCCESS
         exhausted = int(statistics["iter_count"]) >= FATROP_ITERATIONS
         return Status.MAXITER if exhausted else Status.QP_FAILURE
-
-    def _warm(self, result: dict[str, Any]) -> Array:
-        """Variables, group by group (N, 13)."""
-        return np.asarray(result["x"]).reshape(-1, self.GROUP)
 
 
 def _tightened(bounds: list[float], sign: float, equal: list[bool] | None = None) -> Array:

@@ -12,9 +12,9 @@ u = [a, delta], output y = C x = [vx, psi, X, Y] (kumar2025lpv, section III)::
     |vy_i| <= ratio vx_i            (soft)       i = 1..N
     vx'_min <= vx'(x_i, u_i) <= vx'_max (soft)   i = 0..N-1
 
-A soft constraint may be broken by its slack s >= 0 at a price of linear s + 1/2 quadratic s^2; the
-price is exact for multipliers below `linear`, so a slack is used only where the path asks for the
-impossible (the limit on vy alone caps curvature, see the errata).
+A soft constraint may be violated by a slack s >= 0 at a cost of linear s + 1/2 quadratic s^2. This
+penalty is exact for multipliers below `linear`, so slack is used only where the path demands the
+impossible (the limit on vy alone bounds the curvature, see the errata).
 """
 
 import math
@@ -48,20 +48,21 @@ class Status(Enum):
 
 @dataclass(frozen=True)
 class NmpcProblem:
-    """Dimensions, bounds and penalties of the problem; weights are given with every solve.
+    """Dimensions, bounds and penalties of the problem; every solve takes its own weights.
 
     Parameters
     ----------
     vehicle
-        The prediction model and its constraints.
+        Prediction model and its constraints.
     horizon
-        N, number of control periods predicted.
+        Number of predicted periods, N.
     period
-        Ts, s.
+        Period of the prediction, Ts, s.
     first_period
-        s until the next plan, over which the first input's change is bounded; Ts unless given.
+        Time until the next plan, s, over which the change of the first input is bounded; by default
+        Ts.
     linear_penalty, quadratic_penalty
-        Prices of slack on (vx m/s, vy m/s, vx' m/s^2), shape (3,).
+        Penalties of slack on (vx m/s, vy m/s, vx' m/s^2), shape (3,).
 
     Raises
     ------
@@ -86,9 +87,9 @@ class NmpcProblem:
 
     @property
     def substeps(self) -> int:
-        """Runge-Kutta steps a period, for stability from the least permitted speed upwards.
+        """Runge-Kutta steps per period, for stability from the least permitted speed upwards.
 
-        The lateral poles are fastest at standstill, which a speed range may hold.
+        The lateral poles are fastest at standstill, which a speed range may include.
         """
         slowest = max(self.vehicle.speed_range[0], 0.0)
         return math.ceil(self.period * fastest_pole(slowest, self.vehicle) / RK4_STABILITY)
@@ -109,10 +110,10 @@ class NmpcProblem:
 
 
 class Solution(NamedTuple):
-    """One solve: what came out, how, and at what price.
+    """Result of a solve.
 
-    `inputs` (N, 2) and `states` (N + 1, 6) are the plan, or None where there is none to trust;
-    `slack` (N, 3) by which the soft constraints on vx, vy and vx' are broken in it.
+    `inputs` (N, 2) and `states` (N + 1, 6) are the plan, or None if there is no valid one; `slack`
+    (N, 3) are its violations of the soft constraints on vx, vy and vx'.
     """
 
     status: Status

@@ -75,7 +75,7 @@ class InTurns:
             self.agents[i].reset()
 
     def drive(self, periods: int) -> Array:
-        """Memories after each period, (n, periods, RECORD_SIZE); NaN where the episode is over."""
+        """Records after each period, (n, periods, RECORD_SIZE); NaN where the episode is over."""
         trace = np.full((len(self.envs), periods, k.RECORD_SIZE), np.nan)
         for i, (env, agent) in enumerate(zip(self.envs, self.agents, strict=True)):
             for period in range(periods):
@@ -87,10 +87,10 @@ class InTurns:
                     # A copy: tests put what they like in place of what is seen.
                     actions, memory = agent.predict(env.arrays.observations.copy())
                     self.actions[i] = actions
-                    told = agent.diagnostics(memory[0])
-                    self.failures[i] += told["status"] != "SUCCESS"
-                    self.iterations[i] += told["iterations"]
-                    self.fallbacks[i] = told["fallback"]
+                    report = agent.diagnostics(memory[0])
+                    self.failures[i] += report["status"] != "SUCCESS"
+                    self.iterations[i] += report["iterations"]
+                    self.fallbacks[i] = report["fallback"]
                 env.step(self.actions[i])
                 trace[i, period] = env.records[0]
         return trace

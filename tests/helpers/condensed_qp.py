@@ -1,7 +1,7 @@
-"""The NMPC's quadratic program in the inputs alone, dense: what a plan costs in it, exactly.
+"""The NMPC's condensed QP, dense in the inputs alone: it gives the exact cost of a plan.
 
-Every state is an affine function of the moves w = u - ubar from the plan that the program is
-linearised along, and every slack is the least that its soft constraint needs::
+Every state is an affine function of the moves w = u - ubar from the plan of the linearisation, and
+every slack is the least that its soft constraint needs::
 
     f(w) = 1/2 w' H w + g' w + sum penalty(max(rows w - gaps, 0))
 """
@@ -19,7 +19,7 @@ OUTPUTS = [VX, PSI, X, Y]
 
 
 class CondensedQp:
-    """The program of one situation along its inputs, with CasADi's derivatives."""
+    """QP of one situation along its inputs, with CasADi's derivatives."""
 
     def __init__(
         self,

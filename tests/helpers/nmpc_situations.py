@@ -1,4 +1,4 @@
-"""Situations for the tests of the real-time NMPC: what one solve is given, drawn at random."""
+"""Random situations for the tests of the real-time NMPC: the arguments of one solve."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ MIRROR_OUTPUT = np.array([1.0, -1.0, 1.0, -1.0])
 
 
 class Situation(NamedTuple):
-    """What `solve` takes, in its order; and inputs within the hard limits to linearise along."""
+    """Arguments of `solve`, in its order, and inputs within the hard limits to linearise along."""
 
     state: Array
     last_input: Array
@@ -31,7 +31,7 @@ class Situation(NamedTuple):
 
     @property
     def mirrored(self) -> "Situation":
-        """The same to the other side."""
+        """The situation mirrored, left to right."""
         return Situation(
             self.state * MIRROR_STATE,
             self.last_input * MIRROR_INPUT,

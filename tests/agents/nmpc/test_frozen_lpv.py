@@ -101,7 +101,7 @@ def test_literal_form_weaves_and_the_other_form_drives() -> None:
     assert literal_variation > 3.0 * variation
 
 
-def test_faults_are_told() -> None:
+def test_faults_are_reported() -> None:
     env = environment()
     with pytest.raises(ValueError, match=r"form.*literal, sinc"):
         agents.make("lpv-mpc-frozen", env, form="cosine")

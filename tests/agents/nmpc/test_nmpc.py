@@ -289,7 +289,7 @@ def test_nan_observation_gives_a_status_and_a_finite_action(
 
 
 @pytest.mark.parametrize("blind", [True, False], ids=["NaN", "absurd"])
-def test_ladder_of_fallbacks(nmpc: tuple[gymnasium.Env, Any], blind: bool) -> None:
+def test_fallbacks(nmpc: tuple[gymnasium.Env, Any], blind: bool) -> None:
     """The last plan while there is one, a stop after four failures in a row, else Stanley."""
     env, agent = nmpc
     slices = env.unwrapped.layout.slices
@@ -304,22 +304,22 @@ def test_ladder_of_fallbacks(nmpc: tuple[gymnasium.Env, Any], blind: bool) -> No
     plan, seen = planned_inputs(memory), []
     for k in range(6):
         action, memory = agent.predict(lost)
-        told = agent.diagnostics(memory[0])
-        seen.append(told["fallback"])
+        report = agent.diagnostics(memory[0])
+        seen.append(report["fallback"])
         assert env.action_space.contains(action)
-        assert (told["status"] == "NAN") == blind
+        assert (report["status"] == "NAN") == blind
         if blind:
-            assert told["plan"] is None
-            assert told["slack"] is None
-        if told["fallback"] == "plan":
+            assert report["plan"] is None
+            assert report["slack"] is None
+        if report["fallback"] == "plan":
             np.testing.assert_allclose(action, plan[k + 1], atol=1e-6)
     assert seen == ["plan"] * 4 + ["stop"] * 2
     (status,) = set(counts(memory)) - {"plan", "stop"}
     assert counts(memory) == {status: 6, "plan": 4, "stop": 2}
     # A solve that succeeds ends it, and the failures are counted from anew.
     _, memory = agent.predict(observation)
-    told = agent.diagnostics(memory[0])
-    assert (told["status"], told["fallback"]) == ("SUCCESS", "")
+    report = agent.diagnostics(memory[0])
+    assert (report["status"], report["fallback"]) == ("SUCCESS", "")
     _, memory = agent.predict(lost)
     assert agent.diagnostics(memory[0])["fallback"] == "plan"
     # Without any plan to fall back on: Stanley, then a stop.
@@ -361,7 +361,7 @@ def test_a_plan_that_is_used_up_is_followed_by_stanley() -> None:
         assert seen == ["plan", "plan", "stanley", "stanley"], name
 
 
-def test_ladder_of_fallbacks_when_solves_fail(
+def test_fallbacks_when_solves_fail(
     ipopt: tuple[gymnasium.Env, IpoptNmpc], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env, agent = ipopt
@@ -373,12 +373,12 @@ def test_ladder_of_fallbacks_when_solves_fail(
     seen = []
     for k in range(6):
         action, memory = agent.predict(observation)
-        told = agent.diagnostics(memory[0])
-        assert told["status"] == "INFEASIBLE"
-        seen.append(told["fallback"])
-        if told["fallback"] == "plan":
+        report = agent.diagnostics(memory[0])
+        assert report["status"] == "INFEASIBLE"
+        seen.append(report["fallback"])
+        if report["fallback"] == "plan":
             np.testing.assert_allclose(action, plan[k + 1], atol=1e-6)
-        if told["fallback"] == "stop":
+        if report["fallback"] == "stop":
             assert action[0] < 0
     assert seen == ["plan"] * 4 + ["stop"] * 2
     assert memory[0].fallback.counts == {"INFEASIBLE": 6, "plan": 4, "stop": 2}
@@ -441,8 +441,8 @@ def test_schedule_by_band_and_by_path(nmpc: tuple[gymnasium.Env, Any]) -> None:
         observation, _ = env.reset(options={"arc_length": s})
         _, memory = by_band.predict(observation, episode_start=np.array([True]))
         bands.add(band := int(memory.bands[0] if hasattr(memory, "bands") else memory[0].band[0]))
-        told = by_band.diagnostics(memory[0])["weights"]
-        np.testing.assert_array_equal(told, sets[band].as_array())
+        report = by_band.diagnostics(memory[0])["weights"]
+        np.testing.assert_array_equal(report, sets[band].as_array())
     assert bands == {0, 3}
 
 

@@ -58,7 +58,7 @@ def test_episode_start_clears_the_marked_rows_alone(n: int) -> None:
 
 def test_failures_of_one_row_are_not_anothers() -> None:
     rows, agent, healthy = drives(3, 8), made(max_failures=2), made(max_failures=2)
-    told = []
+    report = []
     for k, row in enumerate(rows):
         lost = row.copy()
         if k >= 2:
@@ -67,11 +67,11 @@ def test_failures_of_one_row_are_not_anothers() -> None:
             lost[2, 0] = np.inf
         actions, memory = agent.predict(lost, None, np.array([False, False, k == 7]))
         np.testing.assert_array_equal(actions[0], healthy.predict(row)[0][0])
-        told.append([agent.diagnostics(memory[i])["fallback"] for i in range(3)])
+        report.append([agent.diagnostics(memory[i])["fallback"] for i in range(3)])
     # Row 2 begins anew in the last step: no plan any more, one failure.
-    assert [row[1] for row in told] == ["", "", "plan", "plan", "stop", "stop", "stop", "stop"]
-    assert [row[2] for row in told] == ["", "", "", "", "plan", "plan", "stop", "stanley"]
-    assert not any(row[0] for row in told)
+    assert [row[1] for row in report] == ["", "", "plan", "plan", "stop", "stop", "stop", "stop"]
+    assert [row[2] for row in report] == ["", "", "", "", "plan", "plan", "stop", "stanley"]
+    assert not any(row[0] for row in report)
 
 
 def test_failures_are_found_in_every_threads_share() -> None:
@@ -158,8 +158,8 @@ def test_actions_and_diagnostics_handed_out_are_copies() -> None:
     for row in rows:
         actions, memory = agent.predict(row)
         np.testing.assert_array_equal(actions, untouched.predict(row)[0])
-        told = agent.diagnostics(memory[1])
-        for value in (actions, told["plan"], told["slack"], told["weights"]):
+        report = agent.diagnostics(memory[1])
+        for value in (actions, report["plan"], report["slack"], report["weights"]):
             value[:] = 7.0
 
 
@@ -172,16 +172,16 @@ def test_diagnostics_of_a_row() -> None:
         single.reset()
         for row in rows:
             _, alone = single.predict(row[k])
-        wanted, told = single.diagnostics(alone[0]), agent.diagnostics(memory[k])
-        assert told.keys() == wanted.keys()
-        assert told["status"] == "SUCCESS"
-        assert told["plan"].shape == (21, 2)
+        wanted, report = single.diagnostics(alone[0]), agent.diagnostics(memory[k])
+        assert report.keys() == wanted.keys()
+        assert report["status"] == "SUCCESS"
+        assert report["plan"].shape == (21, 2)
         # The plan begins where the vehicle is, in the frame of the path's foot point.
-        np.testing.assert_allclose(told["plan"][0], [0.0, rows[-1][k][5]])
-        assert told["slack"].shape == (3,)
+        np.testing.assert_allclose(report["plan"][0], [0.0, rows[-1][k][5]])
+        assert report["slack"].shape == (3,)
         for name in ("status", "iterations", "cost", "fallback"):
-            assert told[name] == wanted[name]
-    np.testing.assert_array_equal(agent.diagnostics(memory[-1])["plan"], told["plan"])
+            assert report[name] == wanted[name]
+    np.testing.assert_array_equal(agent.diagnostics(memory[-1])["plan"], report["plan"])
     with pytest.raises(IndexError, match="row 3 of 3"):
         memory[3]
 
@@ -242,8 +242,8 @@ def test_schedule_by_band_chooses_for_every_row() -> None:
         fixed = made(weights=sets[band])
         wanted, alone = fixed.predict(row)
         np.testing.assert_array_equal(wanted, action)
-        for told in (agent.diagnostics(memory[k]), fixed.diagnostics(alone[0])):
-            np.testing.assert_array_equal(told["weights"], sets[band].as_array())
+        for report in (agent.diagnostics(memory[k]), fixed.diagnostics(alone[0])):
+            np.testing.assert_array_equal(report["weights"], sets[band].as_array())
     broken = rows.copy()
     broken[0, len(SCALARS)] = np.nan
     assert np.isfinite(agent.predict(broken)[0]).all()

@@ -33,11 +33,11 @@ def test_wild_observations(vehicle: str) -> None:
             assert (actions <= env.action_space.high).all()  # type: ignore[attr-defined]
             finite = np.isfinite(rows).all(axis=1)
             for k in range(n):
-                told = agent.diagnostics(memory[k])
-                status = Status(told["status"])
+                report = agent.diagnostics(memory[k])
+                status = Status(report["status"])
                 assert (status is Status.NAN) == (not finite[k])
-                assert 0 <= told["iterations"] <= MAX_ITERATIONS
-                assert (told["fallback"] == "") == (status is Status.SUCCESS)
+                assert 0 <= report["iterations"] <= MAX_ITERATIONS
+                assert (report["fallback"] == "") == (status is Status.SUCCESS)
                 statuses[status.value] += 1
     solvable = statuses.total() - statuses["NAN"]
     assert statuses["NAN"] > 0.03 * statuses.total()

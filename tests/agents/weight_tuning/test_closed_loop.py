@@ -236,13 +236,13 @@ def test_tables_with_a_set_for_each_band_are_a_schedule() -> None:
     bands = CurvatureBands()
     followed = loop_of(3, CALM, weights=WeightSchedule(bands, sets, slew=3.0))
     envs = environments(3, **CALM)
-    told = ClosedLoop(envs, agents.make("lpv-nmpc", envs.single), bands=bands, slew=3.0)
+    given_tables = ClosedLoop(envs, agents.make("lpv-nmpc", envs.single), bands=bands, slew=3.0)
     table = np.array([one.as_array() for one in sets])
-    for loop in (followed, told):
+    for loop in (followed, given_tables):
         loop.reset(seed=1)
     given = np.tile(table, (3, 1, 1))
-    np.testing.assert_array_equal(told.drive(60, given), followed.drive(60))
-    np.testing.assert_array_equal(told.memory.nmpc.weights, followed.memory.nmpc.weights)
+    np.testing.assert_array_equal(given_tables.drive(60, given), followed.drive(60))
+    np.testing.assert_array_equal(given_tables.memory.nmpc.weights, followed.memory.nmpc.weights)
 
 
 def test_until_band_stops_where_the_band_changes() -> None:
@@ -294,7 +294,7 @@ def test_copies_drive_as_their_originals() -> None:
     assert not np.array_equal(trace[2], trace[0])
 
 
-# What is told --------------------------------------------------------------------------------
+# Tally -----------------------------------------------------------------------------------------
 
 
 def test_tally_is_the_sums_over_the_trace() -> None:

@@ -47,11 +47,11 @@ def test_diagnostics_after_a_drive_are_those_of_its_last_period() -> None:
     loop.reset(seed=9)
     loop.envs.arrays.observations[1, 5] = np.nan
     loop.drive(1)
-    told = [loop.agent.diagnostics(loop.memory.nmpc[row]) for row in range(2)]
-    assert [(t["status"], t["fallback"]) for t in told] == [("SUCCESS", ""), ("NAN", "stanley")]
+    report = [loop.agent.diagnostics(loop.memory.nmpc[row]) for row in range(2)]
+    assert [(t["status"], t["fallback"]) for t in report] == [("SUCCESS", ""), ("NAN", "stanley")]
     loop.drive(1)
-    told = [loop.agent.diagnostics(loop.memory.nmpc[row]) for row in range(2)]
-    assert [(t["status"], t["fallback"]) for t in told] == [("SUCCESS", "")] * 2
+    report = [loop.agent.diagnostics(loop.memory.nmpc[row]) for row in range(2)]
+    assert [(t["status"], t["fallback"]) for t in report] == [("SUCCESS", "")] * 2
 
 
 def test_failures_in_the_middle_of_a_call() -> None:
