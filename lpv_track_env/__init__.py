@@ -33,7 +33,7 @@ if PATH_TRACKING not in gymnasium.registry:
     gymnasium.register(
         id=WEIGHT_TUNING,
         entry_point="agents.weight_tuning.env:WeightTuningEnv",
-        vector_entry_point="agents.weight_tuning.vector_env:WeightTuningVectorEnv",
+        vector_entry_point="agents.weight_tuning.env:WeightTuningVectorEnv",
     )
     gymnasium.register(
         id=HIGHWAY_TRACK,

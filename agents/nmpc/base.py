@@ -2,7 +2,9 @@
 
 from abc import ABC
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,13 +14,56 @@ from agents.base import DrivingTask, TrackingAgent
 from agents.classical.geometric import Stanley
 from agents.nmpc.problem import NmpcProblem
 from agents.nmpc.schedule import Switching
-from agents.nmpc.settings import NmpcSettings
 from agents.reference import local_reference
-from agents.weights import TrackingWeights, WeightSchedule
+from agents.weights import TrackingWeights, WeightSchedule, weights_from
 from lpv_track_env.observation import TrackingObservation
+from lpv_track_env.vehicle import VehicleParameters
 
 Array = NDArray[np.float64]
 Memory = TypeVar("Memory")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NmpcSettings:
+    """Settings of an NMPC agent.
+
+    Parameters
+    ----------
+    horizon
+        Horizon N, at most the preview steps of the observation (the default).
+    weights
+        Fixed weights, a schedule, or the file of a schedule. Either may be given as a mapping, too:
+        `{"Q": [4 numbers], "S": [4], "R": [2]}`, or a schedule in the form of its file. Once the
+        settings are made, these are `TrackingWeights` or a `WeightSchedule`.
+    selection
+        Rule by which a schedule chooses: "band" from the sharpest curvature in the preview at every
+        step, or "path" once from the path's sharpest curvature, the paper's rule.
+    model
+        Prediction model and its constraints, by default the task's own vehicle.
+    linear_penalty, quadratic_penalty
+        Penalties of slack on (vx, vy, vx'), see `NmpcProblem`.
+    max_failures
+        Failed solves in a row after which the vehicle is brought to a stop.
+
+    Raises
+    ------
+    ValueError
+        For an unknown selection, weights that cannot be used, or a file that cannot be read.
+    """
+
+    horizon: int | None = None
+    weights: TrackingWeights | WeightSchedule | Mapping[str, Any] | str | Path | None = None
+    selection: str = "band"
+    model: VehicleParameters | None = None
+    linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0)
+    quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0)
+    max_failures: int = 10
+
+    def __post_init__(self) -> None:
+        if self.selection not in {"band", "path"}:
+            raise ValueError(f"selection must be 'band' or 'path', not {self.selection!r}")
+        weights = TrackingWeights() if self.weights is None else weights_from(self.weights)
+        object.__setattr__(self, "weights", weights)
 
 
 @dataclass

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from agents.base import DrivingTask
+from agents.nmpc.base import NmpcSettings
 from agents.nmpc.ipopt_agent import SolvedNmpc
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.nmpc.rti_solver import RtiSolver
-from agents.nmpc.settings import NmpcSettings, passes_settings
 from lpv_track_env.bicycle import PSI, VX, VY, X, Y
 from lpv_track_env.lpv import matrices
+from lpv_track_env.validation import forwards_arguments
 from trajectories.naming import choose
 
 Array = NDArray[np.float64]
@@ -127,8 +128,8 @@ class FrozenLpvMpc(SolvedNmpc):
         Task of the agent.
     form
         "literal" or "sinc", see `FrozenLpvSolver`.
-    **settings
-        Settings of all NMPC agents, see `NmpcSettings`.
+    settings
+        Keyword arguments of `NmpcSettings`, one by one.
 
     Raises
     ------
@@ -136,7 +137,9 @@ class FrozenLpvMpc(SolvedNmpc):
         If a setting is out of range, or the form unknown.
     """
 
-    @passes_settings(NmpcSettings)
-    def __init__(self, task: DrivingTask, *, form: str = "literal", **settings: Any) -> None:
+    @forwards_arguments(NmpcSettings)
+    def __init__(
+        self, settings: dict[str, Any], task: DrivingTask, *, form: str = "literal"
+    ) -> None:
         super().__init__(task, NmpcSettings(**settings))
         self.solver = FrozenLpvSolver(self.problem, form=form)

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import DrivingTask
-from agents.nmpc.base import Fallback, NmpcAgent
+from agents.nmpc.base import Fallback, NmpcAgent, NmpcSettings
 from agents.nmpc.casadi_solvers import FatropSolver, IpoptSolver
 from agents.nmpc.problem import Solution, Status
 from agents.nmpc.schedule import NO_BAND, WEIGHTS
-from agents.nmpc.settings import NmpcSettings, passes_settings
 from lpv_track_env.observation import TrackingObservation
+from lpv_track_env.validation import forwards_arguments
 from trajectories.naming import choose
 
 Array = NDArray[np.float64]
@@ -124,8 +124,8 @@ class IpoptNmpc(SolvedNmpc):
         Tolerance of the solver, and IPOPT's time limit of a solve, s. The default is far above any
         solve, which 100 iterations bound, so that results do not depend on the machine's load;
         lower it to drive in real time. fatrop has no time limit, but at most 200 iterations.
-    **settings
-        Settings of all NMPC agents, see `NmpcSettings`.
+    settings
+        Keyword arguments of `NmpcSettings`, one by one.
 
     Raises
     ------
@@ -133,15 +133,15 @@ class IpoptNmpc(SolvedNmpc):
         If the horizon is longer than the preview, or a setting is out of range.
     """
 
-    @passes_settings(NmpcSettings)
+    @forwards_arguments(NmpcSettings)
     def __init__(
         self,
+        settings: dict[str, Any],
         task: DrivingTask,
         *,
         solver: str = "ipopt",
         tolerance: float = 1e-6,
         max_seconds: float = 20.0,
-        **settings: Any,
     ) -> None:
         super().__init__(task, NmpcSettings(**settings))
         if choose("solver", solver, SOLVERS) == "fatrop":

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from agents.base import Action, DrivingTask, observation_rows
 from agents.nmpc import layout, qp, rti
-from agents.nmpc.base import Fallback, NmpcAgent
+from agents.nmpc.base import Fallback, NmpcAgent, NmpcSettings
 from agents.nmpc.problem import INPUTS, STATES, Status
 from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
 from agents.nmpc.schedule import NO_BAND, WEIGHTS
-from agents.nmpc.settings import NmpcSettings, passes_settings
 from lpv_track_env.observation import TrackingObservation
-from lpv_track_env.validation import checked_threads
+from lpv_track_env.validation import checked_threads, forwards_arguments
 from lpv_track_env.vector_kernels import shares, using_threads
 
 Array = NDArray[np.float64]
@@ -101,8 +100,8 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         Tolerance of the QP.
     threads
         Threads that share a batch of observations, 1 by default. Results do not depend on it.
-    **settings
-        Settings of all NMPC agents, see `NmpcSettings`.
+    settings
+        Keyword arguments of `NmpcSettings`, one by one.
 
     Raises
     ------
@@ -110,15 +109,15 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         If the horizon is longer than the preview, or a setting is out of range.
     """
 
-    @passes_settings(NmpcSettings)
+    @forwards_arguments(NmpcSettings)
     def __init__(
         self,
+        settings: dict[str, Any],
         task: DrivingTask,
         *,
         damping: tuple[float, float] = DAMPING,
         tolerance: float = 1e-12,
         threads: int = 1,
-        **settings: Any,
     ) -> None:
         super().__init__(task, NmpcSettings(**settings))
         self.solver = RtiSolver(self.problem, damping=damping, tolerance=tolerance)

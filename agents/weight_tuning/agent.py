@@ -12,7 +12,6 @@ from agents.base import CHECKPOINTS, Action, DrivingTask, check_compatible, obse
 from agents.delay import NearFuture, moved_plan
 from agents.nmpc import qp
 from agents.nmpc.rti_agent import RtiNmpc
-from agents.nmpc.settings import passes_settings
 from agents.reference import NODE
 from agents.weight_tuning.decision import NO_POLICY, Decider
 from agents.weight_tuning.features import REJECTED
@@ -20,6 +19,7 @@ from agents.weight_tuning.loop_kernels import finish_rows, prepare_rows
 from agents.weight_tuning.loop_memory import LoopMemory, LoopRow
 from agents.weight_tuning.policy import WeightPolicy, load
 from agents.weights import TrackingWeights, WeightSchedule, weights_from
+from lpv_track_env.validation import forwards_arguments
 from trajectories.compilation import entry_point
 
 Weights = WeightPolicy | WeightSchedule | TrackingWeights
@@ -51,8 +51,8 @@ class TunedNmpc:
         Predict the NMPC's observation to the time at which its action takes effect, see
         `agents.delay`; by default where the task has delays. The driving history uses the
         observations as they are.
-    **settings
-        Settings of `RtiNmpc`, except `selection`.
+    settings
+        Keyword arguments of `RtiNmpc`, one by one, except `selection`.
 
     Raises
     ------
@@ -64,14 +64,14 @@ class TunedNmpc:
     compensates_delays: ClassVar[bool] = True
     """The class takes `delay_compensation` itself: `agents.make` does not wrap it."""
 
-    @passes_settings(RtiNmpc, "selection")
+    @forwards_arguments(RtiNmpc, "selection")
     def __init__(
         self,
+        settings: dict[str, Any],
         task: DrivingTask,
         *,
         weights: str | Path | Mapping[str, Any] | Weights = "search",
         delay_compensation: bool | None = None,
-        **settings: Any,
     ) -> None:
         self.task = task
         self.weights = _loaded(weights)
@@ -86,7 +86,7 @@ class TunedNmpc:
         fixed = None if isinstance(self.weights, WeightPolicy) else self.weights
         self.nmpc = RtiNmpc(task, weights=fixed, **settings)
         delayed = task.delayed if delay_compensation is None else delay_compensation
-        self.future = NearFuture(task, task.actuation, settings.get("model")) if delayed else None
+        self.future = NearFuture(task, task.actuation, settings["model"]) if delayed else None
         self._decider = (
             None if policy is None else Decider(policy.choice, policy.layers, task.control_period)
         )

@@ -8,8 +8,8 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from agents.sb3 import AdapterVecEnv
+from agents.weight_tuning.env import WeightTuningVectorEnv
 from agents.weight_tuning.policy import WeightPolicy
-from agents.weight_tuning.vector_env import WeightTuningVectorEnv
 
 Array = NDArray[Any]
 Infos = list[dict[str, Any]]

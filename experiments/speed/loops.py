@@ -11,7 +11,7 @@ import numpy as np
 
 import agents
 from agents.weight_tuning.closed_loop import ClosedLoop
-from agents.weight_tuning.vector_env import WeightTuningVectorEnv
+from agents.weight_tuning.env import WeightTuningVectorEnv
 from experiments.speed import environments
 from experiments.speed.measure import (
     Effort,

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 
+from agents.weight_tuning.env import WeightTuningVectorEnv
 from agents.weight_tuning.features import subset_mask
 from agents.weight_tuning.learner import WeightLearnerVecEnv
 from agents.weight_tuning.policy import WeightPolicy
-from agents.weight_tuning.vector_env import WeightTuningVectorEnv
 from experiments.jobs import checkpoint
 from experiments.jobs.paths import episode_seed
 from experiments.tuning.settings import TuningSettings

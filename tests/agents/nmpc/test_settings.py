@@ -8,10 +8,10 @@ import pytest
 
 import agents
 from agents.base import DrivingTask
+from agents.nmpc.base import NmpcSettings
 from agents.nmpc.frozen import FrozenLpvMpc
 from agents.nmpc.ipopt_agent import IpoptNmpc
 from agents.nmpc.rti_agent import RtiNmpc
-from agents.nmpc.settings import NmpcSettings
 from agents.registry import agent_class
 from agents.weight_tuning.agent import TunedNmpc
 from agents.weights import TrackingWeights, WeightSchedule
@@ -42,7 +42,7 @@ def test_misspelt_settings_are_named(name: str) -> None:
     with pytest.raises(ValueError, match=r"has no setting 'horizn'; known: .*nearest: horizon"):
         agents.make(name, env, horizn=10)
     kind: Any = agent_class(name)
-    with pytest.raises(TypeError, match="horizn"):
+    with pytest.raises(TypeError, match=r"unknown argument 'horizn'; known: .*nearest: horizon"):
         kind(DrivingTask.of(env), horizn=10)
 
 

@@ -12,9 +12,8 @@ import agents
 from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.closed_loop import ClosedLoop
 from agents.weight_tuning.decision import Decider
-from agents.weight_tuning.env import WeightTuningEnv
+from agents.weight_tuning.env import WeightTuningEnv, WeightTuningVectorEnv
 from agents.weight_tuning.features import REJECTED, names
-from agents.weight_tuning.vector_env import WeightTuningVectorEnv
 from tests.helpers.closed_loops import environments, traced
 from tests.helpers.tuned_drives import CALM, CHOICES, LIVELY, random_actions
 

@@ -17,8 +17,7 @@ from gymnasium.wrappers import PassiveEnvChecker
 from numpy.typing import NDArray
 
 from agents.weight_tuning.choice import WeightChoice
-from agents.weight_tuning.env import WeightTuningEnv
-from agents.weight_tuning.vector_env import WeightTuningVectorEnv
+from agents.weight_tuning.env import WeightTuningEnv, WeightTuningVectorEnv
 from lpv_track_env import WEIGHT_TUNING
 from lpv_track_env.env import PathTrackingEnv
 from tests.helpers.tuned_drives import CALM, CHOICES, LIVELY, SCHEDULE, random_actions

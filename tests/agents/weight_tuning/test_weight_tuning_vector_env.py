@@ -12,8 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
 from agents.weight_tuning.choice import WeightChoice
-from agents.weight_tuning.env import WeightTuningEnv
-from agents.weight_tuning.vector_env import WeightTuningVectorEnv
+from agents.weight_tuning.env import WeightTuningEnv, WeightTuningVectorEnv
 from lpv_track_env import WEIGHT_TUNING
 from tests.helpers.tuned_drives import CALM, CHOICES, LIVELY, random_actions
 from tests.helpers.vector_equality import assert_equal, step_both
