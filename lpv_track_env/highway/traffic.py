@@ -23,7 +23,7 @@ from trajectories import ReferencePath
 
 Array = NDArray[np.float64]
 
-FORESEEN = (0.75, 1.5, 2.25, 3.0)
+PREDICTION_TIMES = (0.75, 1.5, 2.25, 3.0)
 """Times, s, at which the positions of vehicles that follow their lanes are predicted."""
 NOBODY = Leader(math.inf, math.nan)
 """Stands for a free road."""
@@ -209,7 +209,7 @@ def _predicted(other: RoadObject, stretch: Stretch) -> Iterator[tuple[float, Loc
     """Predict a vehicle that goes on along its lane: times, s, and where it is beside the path."""
     if not isinstance(other, ControlledVehicle) or other.crashed:
         return
-    for time in FORESEEN:
+    for time in PREDICTION_TIMES:
         position, heading = _along_lanes(other, other.speed * time)
         velocity = other.speed * np.array([math.cos(heading), math.sin(heading)])
         located = stretch.locate(other, position, heading, velocity)
