@@ -1,7 +1,8 @@
 """`lpv-track benchmark`: agents x trajectories x seeds, the paper's table, and a report."""
 
 import argparse
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -22,6 +23,9 @@ from experiments.commands.options import (
     resumable,
     seeds_of,
 )
+
+if TYPE_CHECKING:
+    from experiments.run.store import ResultStore
 
 EXAMPLE = "lpv-track benchmark --agents stanley lqr --trajectories T1 T2 --out results/mine"
 
@@ -60,7 +64,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the cases, print the tables, write the report; return 1 if a case failed, else 0."""
     from experiments.run import suites
-    from experiments.run.benchmark import distinct, finish, run_benchmark
+    from experiments.run.benchmark import distinct, run_benchmark, selected
     from trajectories.naming import choose
 
     seeds = seeds_of(options)
@@ -98,7 +102,24 @@ def run(options: argparse.Namespace, console: Console) -> int:
             specs, options.out, workers=options.workers, settings=settings,
             resume=options.resume, console=console,
         )  # fmt: skip
-    return finish(store, specs, console)
+    return finish(store, selected(store, specs), console)
+
+
+def finish(store: "ResultStore", cases: Sequence[Mapping[str, Any]], console: Console) -> int:
+    """Print tables, write the report, say where the rest is; return 1 if a case failed, else 0."""
+    from experiments.report.build import where, write_report
+    from experiments.run.benchmark import print_failed
+    from experiments.run.console_tables import screen
+
+    tables, complete = screen(cases)
+    console.print(tables)
+    report = write_report(store.folder)
+    failed = print_failed(cases, console)
+    lines = [where(report)]
+    if not complete:
+        lines.append(f"cases: {store.cases_file}; all tables: lpv-track report {store.folder}")
+    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    return 1 if failed else 0
 
 
 def merged(spec: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

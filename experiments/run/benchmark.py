@@ -1,4 +1,4 @@
-"""Running cases: those that a folder lacks, with progress; then tables and the report."""
+"""Runs of many cases: those that a folder of results lacks are run, with progress."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -17,10 +17,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from experiments.report.build import where, write_report
 from experiments.run import engines
 from experiments.run.case import BaseCase, Case, run_case, worker_death
-from experiments.run.console_tables import screen
 from experiments.run.engines import Interrupts
 from experiments.run.store import ResultStore
 from experiments.run.tables import path_name
@@ -153,20 +151,6 @@ def selected(
     """Return the results of some specs, in their order."""
     by_id = {case["id"]: case for case in store.cases()}
     return [by_id[key] for spec in specs if (key := kind(**spec).id) in by_id]
-
-
-def finish(store: ResultStore, specs: Sequence[Spec], console: Console) -> int:
-    """Print tables, write the report, say where the rest is; return 1 if a case failed, else 0."""
-    cases = selected(store, specs)
-    tables, complete = screen(cases)
-    console.print(tables)
-    report = write_report(store.folder)
-    failed = print_failed(cases, console)
-    lines = [where(report)]
-    if not complete:
-        lines.append(f"cases: {store.cases_file}; all tables: lpv-track report {store.folder}")
-    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
-    return 1 if failed else 0
 
 
 def print_failed(cases: Sequence[Mapping[str, Any]], console: Console) -> int:

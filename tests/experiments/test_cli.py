@@ -46,7 +46,7 @@ def copy(small: Path, tmp_path: Path) -> Path:
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the report out where it is not what is tested: it takes a second."""
     monkeypatch.setattr(
-        "experiments.run.benchmark.write_report", lambda folder: folder / "cases.jsonl"
+        "experiments.report.build.write_report", lambda folder: folder / "cases.jsonl"
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from experiments.commands.benchmark import finish
 from experiments.run import benchmark, suites
 from experiments.run.console_tables import SCREEN, screen
 from experiments.run.store import ResultStore
@@ -96,7 +97,7 @@ def test_the_end_says_where_the_rest_is(tmp_path: Path) -> None:
     store = folder_of(tmp_path, results, traces=False)
     for chosen, most in ((specs, 30), (specs[:2], 40)):
         console = Console(width=120, file=io.StringIO())
-        assert benchmark.finish(store, chosen, console) == 0
+        assert finish(store, benchmark.selected(store, chosen), console) == 0
         text = console.file.getvalue()  # type: ignore[attr-defined]
         assert len(text.splitlines()) <= most
         assert f"report: {tmp_path / 'report.html'} (" in text
