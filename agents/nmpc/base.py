@@ -173,8 +173,9 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
         low, high = self.problem.input_bounds
         o = observation
         state = np.array(
-            [o.longitudinal_speed, o.lateral_speed, o.heading_error, o.yaw_rate, 0.0, o.lateral_error]
-        )
+            [o.longitudinal_speed, o.lateral_speed, o.heading_error, o.yaw_rate, 0.0,
+             o.lateral_error]
+        )  # fmt: skip
         last = np.array([o.acceleration, o.steering_angle]).clip(low, high)
         nodes = local_reference(o, self.problem.period)
         stacked = np.stack([nodes.speed, nodes.heading, nodes.x, nodes.y], axis=-1)
