@@ -26,7 +26,7 @@ START, INPUTS, OUTPUTS, ACTIVATION = range(4)
 
 ACTIVATIONS = ("tanh", "relu", "clip")
 """Names of the activations by their codes."""
-TANH, RELU, CLIP = range(3)
+TANH, RELU = ACTIVATIONS.index("tanh"), ACTIVATIONS.index("relu")
 
 # Indices in `numbers` (9,): limit of the features; a, then delta, of each of the others.
 LIMIT, CENTRE, HALF, LOW, HIGH = 0, 1, 3, 5, 7

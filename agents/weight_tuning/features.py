@@ -5,7 +5,7 @@ state. Mean squares are kept with a short and a long time constant, which separa
 weaving. Features have a magnitude of one, and are the same for left and right.
 
 ====================  =====  ===================================================================
-features              count  meaning, and the scale that they are divided by
+features              count  meaning (scale that they are divided by)
 ====================  =====  ===================================================================
 situation             8      vx - 10 m/s (10), |vy| (0.5 m/s), |r| (0.3 rad/s), reported a
                              (2 m/s^2), |reported delta| (0.2 rad), |lateral error| (0.1 m),
@@ -200,9 +200,9 @@ def bounded(value: Any) -> Any:
 
 @compiled
 def fill_features(
-    o: Array, w: Array, used: Array, base: Array, band: int, scales: Array, log_span: Any, x: Array
+    o: Array, h: Array, used: Array, base: Array, band: int, scales: Array, log_span: Any, x: Array
 ) -> None:
-    """Fill the features `x` (size,) for an observation `o` and the row `w` of its drive's history.
+    """Fill the features `x` (size,) for an observation `o` and the row `h` of its drive's history.
 
     `used` (10,) are the weights in use, zeros before the first choice; `base` (bands, 10) those
     that an action multiplies; `band` may be -1.
@@ -230,12 +230,12 @@ def fill_features(
     at += 2
     for means in (QUICK, SLOW):
         for j in range(COUNT):
-            square = w[means + j] / (scales[j] * scales[j])
+            square = h[means + j] / (scales[j] * scales[j])
             x[at] = bounded(0.25 * math.log(square + LEAST))
             at += 1
-    since = max(w[CLOCK], 1.0)
-    x[at] = bounded(w[ITERATIONS] / since / 10.0)
-    x[at + 1] = bounded(w[FAILURES] / since)
+    since = max(h[CLOCK], 1.0)
+    x[at] = bounded(h[ITERATIONS] / since / 10.0)
+    x[at + 1] = bounded(h[FAILURES] / since)
     at += 2
     own = max(band, 0)
     for j in range(TUNED):
@@ -248,12 +248,12 @@ def fill_features(
 
 @compiled
 def fill_all(
-    observations: Array, watched: Array, used: Array, base: Array, bands: Array, scales: Array,
+    observations: Array, history: Array, used: Array, base: Array, bands: Array, scales: Array,
     log_span: Any, features: Array,
 ) -> None:  # fmt: skip
     """Apply `fill_features` to every row of `features` (n, size) float32."""
     for row in range(observations.shape[0]):
         fill_features(
-            observations[row], watched[row], used[row], base, bands[row], scales, log_span,
+            observations[row], history[row], used[row], base, bands[row], scales, log_span,
             features[row],
         )  # fmt: skip
