@@ -1,4 +1,4 @@
-"""Has griffe read docstrings as Markdown, see `docstrings`."""
+"""Makes griffe read docstrings as Markdown (see `docstrings`) and show forwarded arguments."""
 
 import importlib.util
 from pathlib import Path
@@ -23,3 +23,14 @@ class MarkdownDocstrings(griffe.Extension):
         """Rewrite one."""
         if obj.docstring is not None:
             obj.docstring.value = _docstrings.markdown(obj.docstring.value)
+
+
+class ForwardedArguments(griffe.Extension):
+    """Shows the parameter of `validation.forwards_arguments` as `**settings`, which callers see."""
+
+    def on_function(self, *, func: griffe.Function, **_: Any) -> None:
+        """Move the parameter to the end, if a function has the decorator."""
+        if any("forwards_arguments" in str(decorator.value) for decorator in func.decorators):
+            own = [parameter for parameter in func.parameters if parameter.name != "settings"]
+            kind = griffe.ParameterKind.var_keyword
+            func.parameters = griffe.Parameters(*own, griffe.Parameter("settings", kind=kind))
