@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from lpv_track_env import kernels, vector_kernels
+from lpv_track_env import kernels, validation, vector_kernels
 from lpv_track_env.conditions import layout
 from lpv_track_env.draws import random_key
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
@@ -19,23 +19,7 @@ from lpv_track_env.episodes import GIVEN, episode_infos, final_infos, single_inf
 from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.plants import BICYCLE
 from lpv_track_env.task import Task, action_space
-from lpv_track_env.validation import (
-    checked_actions,
-    checked_mask,
-    checked_mode,
-    checked_seeds,
-    checked_threads,
-    forwards_arguments,
-    given_start,
-    listed,
-)
-from lpv_track_env.vector_kernels import (
-    ConditionArrays,
-    EnvArrays,
-    StepArrays,
-    shares,
-    using_threads,
-)
+from lpv_track_env.vector_kernels import ConditionArrays, EnvArrays, StepArrays
 from trajectories.compilation import entry_point
 from trajectories.naming import choose
 
@@ -113,7 +97,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
-    @forwards_arguments(PathTrackingEnv)
+    @validation.forwards_arguments(PathTrackingEnv)
     def __init__(
         self,
         settings: dict[str, Any],
@@ -132,15 +116,15 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self.render_mode = settings["render_mode"]
         if self.render_mode is not None:
             choose("render_mode", self.render_mode, tuple(self.metadata["render_modes"]))
-        paths = listed("trajectory", settings["trajectory"])
-        cars = listed("vehicle", settings["vehicle"])
+        paths = validation.listed("trajectory", settings["trajectory"])
+        cars = validation.listed("vehicle", settings["vehicle"])
         self.num_envs = operator.index(num_envs)
         self._single = PathTrackingEnv(**settings | {"trajectory": paths[0], "vehicle": cars[0]})
-        self.autoreset_mode = checked_mode(autoreset_mode)
+        self.autoreset_mode = validation.checked_mode(autoreset_mode)
         self._mode = MODES[self.autoreset_mode]
         self.metadata = {**self._single.metadata, **self.metadata}
         self.metadata["autoreset_mode"] = self.autoreset_mode
-        self._threads = checked_threads(threads)
+        self._threads = validation.checked_threads(threads)
         self._paths, self._cars = paths, cars
         self._drawn = (0, len(paths), len(cars))
         self.tasks = self._tasks_of(paths, cars)
@@ -173,7 +157,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             final_observations=np.zeros((n, size), dtype=np.float32),
             final_vehicles=final_vehicles,
         )
-        self._scratch = np.zeros((shares(self._threads), scratch))
+        self._scratch = np.zeros((vector_kernels.shares(self._threads), scratch))
         self._advance: Callable[..., Any] | None = None
         self._begun = False
         self._nothing_given = np.full(len(GIVEN), np.nan)
@@ -280,17 +264,17 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             not one for each environment. Nothing changes then.
         """
         options = dict(options or {})
-        mask = checked_mask(options.pop("reset_mask", None), self.num_envs)
+        mask = validation.checked_mask(options.pop("reset_mask", None), self.num_envs)
         for key in options:
             choose("reset option", key, RESET_OPTIONS)
-        seeds = checked_seeds(seed, self.num_envs)
+        seeds = validation.checked_seeds(seed, self.num_envs)
         drawn, tasks = self._drawn, self.tasks
         if {"trajectory", "vehicle"} & set(options):
             paths = [options["trajectory"]] if "trajectory" in options else self._paths
             cars = [options["vehicle"]] if "vehicle" in options else self._cars
             tasks = self._tasks_of(paths, cars)
             drawn = (len(self.tasks), len(paths), len(cars))
-        given = given_start(options, min(task.path.length for task in tasks))
+        given = validation.given_start(options, min(task.path.length for task in tasks))
         # All is checked: from here on the last episodes are gone.
         if isinstance(seed, int):
             super().reset(seed=seed)
@@ -345,7 +329,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         """Step as `step` does, without making infos."""
         self._check_order()
         envs, step = self._arrays, self._step
-        step.commands[:] = checked_actions(
+        step.commands[:] = validation.checked_actions(
             actions, envs.ends, self._mode == vector_kernels.NEXT_STEP
         )
         alone = self._threads == 1
@@ -361,7 +345,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         if alone:
             self._advance(*arguments)
         else:
-            with using_threads(self._threads):
+            with vector_kernels.using_threads(self._threads):
                 self._advance(*arguments)
         ended, truncated = envs.ends != kernels.RUNNING, envs.ends == kernels.TIME_LIMIT
         # Copies: a later reset or step writes into the arrays.

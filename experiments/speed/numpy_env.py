@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import field, inverse_speed
-from lpv_track_env.observation import SCALARS
+from lpv_track_env.observation import PREVIEW_START
 from lpv_track_env.task import Task
 from trajectories.projection import SEARCH_WINDOW
 
@@ -178,7 +178,7 @@ class NumpyTracking:
         return rewards
 
     def _observe(self) -> NDArray[np.float32]:
-        first, count = len(SCALARS), self.task.layout.preview_steps
+        first, count = PREVIEW_START, self.task.layout.preview_steps
         values = np.empty((len(self.arc_length), len(self._bound)))
         vx, vy, _, r, _, _ = self.state
         scalars = (vx, vy, r, *self._command, self.lateral_error, self.heading_error)

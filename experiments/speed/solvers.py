@@ -30,7 +30,7 @@ from experiments.speed.measure import (
     interleave,
 )
 from lpv_track_env import PATH_TRACKING
-from lpv_track_env.observation import SCALARS
+from lpv_track_env.observation import PREVIEW_START
 
 NMPC = "lpv-nmpc"
 DRIVER = "lpv-nmpc-ipopt"
@@ -289,7 +289,7 @@ def _outcome(statuses: Mapping[str, int], seconds: Sequence[float]) -> str:
 
 def wild_observations(rng: np.random.Generator, count: int, steps: int) -> Observations:
     """Return random observations (count, size), a twentieth of which are not finite."""
-    first = len(SCALARS)
+    first = PREVIEW_START
     rows = np.empty((count, first + 2 * steps))
     for k, bounds in enumerate(RANGES):
         rows[:, k] = rng.uniform(*bounds, count)

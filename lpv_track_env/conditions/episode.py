@@ -10,25 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels as k
-from lpv_track_env.conditions import layout
-from lpv_track_env.conditions.sensors import (
-    DRAWS,
-    PERIOD_DRAW,
-    begin_estimate,
-    draw_conditions,
-    estimate,
-    read_sensors,
-    send_fix,
-    steering_offset,
-)
-from lpv_track_env.conditions.vehicle import (
-    advance_gust,
-    advance_servos,
-    command_age,
-    drive_vehicle,
-    send_command,
-    stop_acceleration,
-)
+from lpv_track_env.conditions import layout, sensors, vehicle
 from lpv_track_env.episodes import begin
 from lpv_track_env.estimation import filter as filtering
 from trajectories.compilation import compiled, compiled_in_place, compiled_internal
@@ -60,12 +42,14 @@ def take_command(m: Array, record: Array, a: Any, delta: Any, spec: Array, const
             periods * p[k.ACCELERATION_STEP],
         )  # fmt: skip
         m[layout.MISSED_IN_A_ROW] = 0.0
-        send_command(m, commands, now, a, delta, steering_offset(ekf, spec))
+        vehicle.send_command(m, commands, now, a, delta, sensors.steering_offset(ekf, spec))
     m[layout.LATENCY] = m[layout.OCCUPIED] = -1.0
     blind = (
         spec[layout.ESTIMATOR] == layout.EKF and ekf[filtering.FIX_AGE] > spec[layout.MAX_FIX_AGE]
     )
-    stale = command_age(m, commands, now) > spec[layout.MAX_COMMAND_AGE] + layout.TIME_TOLERANCE
+    stale = (
+        vehicle.command_age(m, commands, now) > spec[layout.MAX_COMMAND_AGE] + layout.TIME_TOLERANCE
+    )
     m[layout.STOPPING] = 0.0
     if blind or stale:
         m[layout.STOPPING] = 1.0
@@ -94,10 +78,10 @@ def end_period(
         # The last observation stays, since there is no state that sensors could measure.
         return end
     now = record[k.STEPS] * p[k.PERIOD]
-    draw = PERIOD_DRAW + DRAWS * int(record[k.STEPS])
-    read_sensors(m, record, key, episode, draw, p[k.PERIOD])
-    send_fix(m, fixes, record, now, key, episode, draw, spec)
-    estimate(m, fixes, ekf, record, now, spec, work)
+    draw = sensors.PERIOD_DRAW + sensors.DRAWS * int(record[k.STEPS])
+    sensors.read_sensors(m, record, key, episode, draw, p[k.PERIOD])
+    sensors.send_fix(m, fixes, record, now, key, episode, draw, spec)
+    sensors.estimate(m, fixes, ekf, record, now, spec, work)
     observe_estimate(m, p, table, observation, vx * p[k.PERIOD])
     return end
 
@@ -110,9 +94,11 @@ def drive_under_conditions(
     """Drive one control period of an episode under conditions, in place; return its end's code."""
     bits = take_command(m, record, a, delta, spec, constants)
     period = constants[k.PERIOD]
-    advance_gust(m, key, episode, PERIOD_DRAW + DRAWS * (int(record[k.STEPS]) + 1), period)
+    vehicle.advance_gust(
+        m, key, episode, sensors.PERIOD_DRAW + sensors.DRAWS * (int(record[k.STEPS]) + 1), period
+    )
     commands = m[layout.TAIL : layout.fixes_start(spec)]
-    state = drive_vehicle(m, commands, record, constants, record[k.STEPS] * period)
+    state = vehicle.drive_vehicle(m, commands, record, constants, record[k.STEPS] * period)
     return end_period(
         m, record, state, bits, spec, constants, table, observation, key, episode, work
     )
@@ -143,7 +129,7 @@ def begin_under_conditions(
     begin(record, constants, table, observation, key, episode, given)
     for j in range(m.shape[0]):
         m[j] = 0.0
-    draw_conditions(m, spec, key, episode)
+    sensors.draw_conditions(m, spec, key, episode)
     for j in range(7):
         m[layout.PLANT + j] = constants[j]
     m[layout.PLANT] *= m[layout.MASS_FACTOR]
@@ -157,7 +143,9 @@ def begin_under_conditions(
     m[layout.TAIL] = 0.0
     m[layout.TAIL + 1], m[layout.TAIL + 2] = record[k.ACCELERATION], record[k.STEERING]
     m[layout.QUEUED] = 1.0
-    begin_estimate(m, m[layout.filter_start(spec) :], record, key, episode, PERIOD_DRAW, spec)
+    sensors.begin_estimate(
+        m, m[layout.filter_start(spec) :], record, key, episode, sensors.PERIOD_DRAW, spec
+    )
     e = m[layout.ESTIMATE : layout.TAIL]
     e[k.ACCELERATION], e[k.STEERING] = record[k.ACCELERATION], record[k.STEERING]
     if spec[layout.ESTIMATOR] == layout.TRUTH:
@@ -202,10 +190,10 @@ def command_under_conditions(data: Array, m: Array, spec: Array) -> tuple[Any, A
     commands = m[layout.TAIL : layout.fixes_start(spec)]
     substeps, now = int(constants[k.SUBSTEPS]), record[k.STEPS] * constants[k.PERIOD]
     h = constants[k.PERIOD] / substeps
-    braking = stop_acceleration(m, constants)
+    braking = vehicle.stop_acceleration(m, constants)
     m[layout.MEAN_A] = m[layout.MEAN_DELTA] = 0.0
     for i in range(substeps):
-        a, delta = advance_servos(m, commands, braking, now + i * h, h)
+        a, delta = vehicle.advance_servos(m, commands, braking, now + i * h, h)
         m[layout.MEAN_A] += a / substeps
         m[layout.MEAN_DELTA] += delta / substeps
     return m[layout.MEAN_A], m[layout.SERVO_DELTA] + m[layout.STEERING_OFFSET], bits

@@ -197,7 +197,7 @@ def begin_estimate(
     for j in range(6):
         f[j] = e[j]
     for j in range(filtering.STATES):
-        f[filtering.COVARIANCE + 10 * j] = spec[layout.INITIAL + j]
+        f[filtering.COVARIANCE + filtering.DIAGONAL * j] = spec[layout.INITIAL + j]
     # Heading and yaw rate were measured: their errors are minus those of the biases.
     filtering.correlate(f, PSI, filtering.HEADING_BIAS)
     filtering.correlate(f, YAW_RATE, filtering.GYRO_BIAS)

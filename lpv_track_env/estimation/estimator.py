@@ -263,7 +263,7 @@ class Estimator:
     def covariance(self) -> Array:
         """Covariance of state and biases, (9, 9), a copy."""
         first = filtering.COVARIANCE
-        return self._filter[first : first + 81].reshape(9, 9).copy()
+        return self._filter[first : first + filtering.ENTRIES].reshape(9, 9).copy()
 
     @property
     def position_deviation(self) -> float:

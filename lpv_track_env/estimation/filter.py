@@ -28,6 +28,10 @@ Array = NDArray[Any]
 
 GYRO_BIAS, HEADING_BIAS, STEERING_OFFSET = 6, 7, 8
 STATES = 9
+ENTRIES = STATES * STATES
+"""Entries of the covariance."""
+DIAGONAL = STATES + 1
+"""Distance between two of its diagonal entries."""
 # Array of a filter (`m`), float64: state, covariance (81, row by row), counters, a ring of past
 # nodes.
 COVARIANCE = STATES
@@ -35,15 +39,15 @@ COVARIANCE = STATES
     TIME, LAST_STAMP, NEWEST, NODES, FIX_NIS, READING_NIS, READINGS, FIXES_IN_A_ROW, FIX_AGE,
     FIXES_USED, FIXES_GATED, FIXES_LATE, FIXES_DUPLICATE, FIXES_NOT_FINITE, SPEED_GATED,
     YAW_RATE_GATED, HEADING_GATED, SPEED_IN_A_ROW, YAW_RATE_IN_A_ROW, HEADING_IN_A_ROW,
-) = range(COVARIANCE + 81, COVARIANCE + 101)  # fmt: skip
-FILTER = COVARIANCE + 101
+) = range(COVARIANCE + ENTRIES, COVARIANCE + ENTRIES + 20)  # fmt: skip
+FILTER = COVARIANCE + ENTRIES + 20
 """First entry of the ring of nodes."""
 
 # A node: its time, the step that led to it and the inputs in that step, readings (NaN: none),
 # state and covariance.
 NODE_TIME, NODE_STEP, NODE_A, NODE_DELTA = 0, 1, 2, 3
 NODE_SPEED, NODE_YAW_RATE, NODE_HEADING, NODE_FIX_X, NODE_FIX_Y, NODE_STATE = 4, 5, 6, 7, 8, 9
-NODE = NODE_STATE + STATES + 81
+NODE = NODE_STATE + STATES + ENTRIES
 """Length of a node."""
 
 # Settings of a filter, (SETTINGS,) float64: variances of the readings,
@@ -60,7 +64,7 @@ USED, GATED, LATE, DUPLICATE, NOT_FINITE = range(5)
 FIX_RESULTS = ("used", "gated", "late", "duplicate", "not finite")
 """Outcomes of a fix, by code."""
 
-WORK = 2 * 81
+WORK = 2 * ENTRIES
 """Size of the scratch array."""
 
 JACOBIAN_STEP = 0.35
@@ -122,8 +126,8 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
         vx, vy, 0.0, r, 0.0, 0.0, a, wheels, p0, p1, p2, p3, p4, p5, p6, h, few
     )
     c, sn = math.cos(psi), math.sin(psi)
-    f = work[:81]
-    for k in range(81):
+    f = work[:ENTRIES]
+    for k in range(ENTRIES):
         f[k] = 0.0
     for k in range(STATES):
         f[k * STATES + k] = 1.0
@@ -149,17 +153,17 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
     m[PSI] = psi + turn
     m[X] += dx
     m[Y] += dy
-    propagate_covariance(m, f, work[81:162])
+    propagate_covariance(m, f, work[ENTRIES:])
     d = COVARIANCE
     m[d] += s[VX_DENSITY] * dt
-    m[d + 10 * VY] += s[VY_DENSITY] * dt
-    m[d + 10 * PSI] += s[PSI_DENSITY] * dt
-    m[d + 10 * YAW_RATE] += s[R_DENSITY] * dt
-    m[d + 10 * X] += s[POSITION_DENSITY] * dt
-    m[d + 10 * Y] += s[POSITION_DENSITY] * dt
-    m[d + 10 * GYRO_BIAS] += s[GYRO_DENSITY] * dt
-    m[d + 10 * HEADING_BIAS] += s[HEADING_BIAS_DENSITY] * dt
-    m[d + 10 * STEERING_OFFSET] += s[OFFSET_DENSITY] * dt
+    m[d + DIAGONAL * VY] += s[VY_DENSITY] * dt
+    m[d + DIAGONAL * PSI] += s[PSI_DENSITY] * dt
+    m[d + DIAGONAL * YAW_RATE] += s[R_DENSITY] * dt
+    m[d + DIAGONAL * X] += s[POSITION_DENSITY] * dt
+    m[d + DIAGONAL * Y] += s[POSITION_DENSITY] * dt
+    m[d + DIAGONAL * GYRO_BIAS] += s[GYRO_DENSITY] * dt
+    m[d + DIAGONAL * HEADING_BIAS] += s[HEADING_BIAS_DENSITY] * dt
+    m[d + DIAGONAL * STEERING_OFFSET] += s[OFFSET_DENSITY] * dt
 
 
 @compiled_internal
@@ -224,7 +228,7 @@ def take_reading(
 @compiled_internal
 def inflate(m: Array, state: int, innovation: Any) -> None:
     """Inflate the variance of a state to match a large innovation."""
-    m[COVARIANCE + 10 * state] += innovation * innovation
+    m[COVARIANCE + DIAGONAL * state] += innovation * innovation
 
 
 @compiled_internal
@@ -249,7 +253,7 @@ def take_position(m: Array, x: Any, y: Any, gate: Any, settings: Array, work: Ar
     """Update the filter with a position; return its NIS. One beyond `gate` changes nothing."""
     variance, d = settings[POSITION_VARIANCE], COVARIANCE
     ex, ey = x - m[X], y - m[Y]
-    sxx, syy = m[d + 10 * X] + variance, m[d + 10 * Y] + variance
+    sxx, syy = m[d + DIAGONAL * X] + variance, m[d + DIAGONAL * Y] + variance
     sxy = m[d + X * STATES + Y]
     nis = (ex * ex * syy - 2.0 * ex * ey * sxy + ey * ey * sxx) / (sxx * syy - sxy * sxy)
     if nis <= gate:
@@ -261,14 +265,14 @@ def take_position(m: Array, x: Any, y: Any, gate: Any, settings: Array, work: Ar
 @compiled_internal
 def store_node(m: Array, nodes: Array, k: int) -> None:
     """Store state and covariance in node k."""
-    for j in range(STATES + 81):
+    for j in range(STATES + ENTRIES):
         nodes[k * NODE + NODE_STATE + j] = m[j]
 
 
 @compiled_internal
 def correlate(m: Array, state: int, bias: int) -> None:
     """Correlate the errors of a measured state and of its sensor's bias: they are opposite."""
-    variance = m[COVARIANCE + 10 * bias]
+    variance = m[COVARIANCE + DIAGONAL * bias]
     m[COVARIANCE + state * STATES + bias] = m[COVARIANCE + bias * STATES + state] = -variance
 
 
@@ -338,7 +342,7 @@ def take_fix(m: Array, stamp: Any, x: Any, y: Any, settings: Array, work: Array)
     if late or math.isfinite(node[NODE_FIX_X]):
         m[FIXES_LATE] += 1.0
         return LATE
-    for j in range(STATES + 81):
+    for j in range(STATES + ENTRIES):
         m[j] = node[NODE_STATE + j]
     c, s = math.cos(m[PSI]), math.sin(m[PSI])
     x += (m[VX] * c - m[VY] * s) * early
@@ -353,7 +357,7 @@ def take_fix(m: Array, stamp: Any, x: Any, y: Any, settings: Array, work: Array)
         m[FIXES_IN_A_ROW] += 1.0
         if m[FIXES_IN_A_ROW] < settings[MOST_IN_A_ROW]:
             newest = int(m[NEWEST]) * NODE
-            for j in range(STATES + 81):
+            for j in range(STATES + ENTRIES):
                 m[j] = nodes[newest + NODE_STATE + j]
             return GATED
         inflate(m, X, ex)
@@ -395,7 +399,7 @@ def replay(m: Array, nodes: Array, back: int, settings: Array, work: Array) -> N
 def position_deviation(m: Array) -> Any:
     """Return the standard deviation of the position in its worst direction, m."""
     d = COVARIANCE
-    xx, yy, xy = m[d + 10 * X], m[d + 10 * Y], m[d + X * STATES + Y]
+    xx, yy, xy = m[d + DIAGONAL * X], m[d + DIAGONAL * Y], m[d + X * STATES + Y]
     return math.sqrt(0.5 * (xx + yy) + math.sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy))
 
 

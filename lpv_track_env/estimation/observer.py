@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lpv_track_env import kernels
+from lpv_track_env.bicycle import X, Y
 from lpv_track_env.observation import ObservationLayout
 from trajectories import ReferencePath
 from trajectories.projection import SEARCH_WINDOW, tightest_turn
@@ -39,9 +40,8 @@ class PathObserver:
     def begin(self, state: ArrayLike, near: float | None = None) -> None:
         """Begin at the foot point nearest to a state (6,), or to the arc length `near` (m)."""
         values = np.asarray(state, dtype=np.float64)
-        x, y = float(values[4]), float(values[5])
-        arc = self.path.project(x, y, near=near).arc_length
-        self._record[kernels.ARC_LENGTH] = arc
+        foot = self.path.project(float(values[X]), float(values[Y]), near=near)
+        self._record[kernels.ARC_LENGTH] = foot.arc_length
 
     def observe(
         self, state: ArrayLike, acceleration: float, steering_angle: float

@@ -9,7 +9,7 @@ import pytest
 
 from agents.nmpc import rti
 from agents.weights import TrackingWeights, WeightSchedule
-from lpv_track_env.observation import SCALARS
+from lpv_track_env.observation import PREVIEW_START
 from tests.helpers.driven_vehicles import drives, environment, made
 from trajectories import CurvatureBands
 
@@ -245,7 +245,7 @@ def test_schedule_by_band_chooses_for_every_row() -> None:
         for report in (agent.diagnostics(memory[k]), fixed.diagnostics(alone[0])):
             np.testing.assert_array_equal(report["weights"], sets[band].as_array())
     broken = rows.copy()
-    broken[0, len(SCALARS)] = np.nan
+    broken[0, PREVIEW_START] = np.nan
     assert np.isfinite(agent.predict(broken)[0]).all()
 
 
@@ -285,7 +285,7 @@ def test_horizon_shorter_than_the_preview() -> None:
     assert agent.diagnostics(memory[0])["plan"].shape == (8, 2)
     # What lies beyond the horizon is not looked at.
     changed = rows.copy()
-    changed[:, len(SCALARS) + 7 : len(SCALARS) + 20] = 0.1
+    changed[:, PREVIEW_START + 7 : PREVIEW_START + 20] = 0.1
     np.testing.assert_array_equal(
         made(horizon=7).predict(changed)[0], made(horizon=7).predict(rows)[0]
     )
