@@ -157,7 +157,7 @@ def test_delays_are_compensated_where_there_are_any() -> None:
     for settings, compensated in (
         ({}, True), ({"conditions": "simulation"}, False), ({"delay_compensation": False}, False),
     ):  # fmt: skip
-        assert bool(make(**settings).drives.loop._future.size) == compensated
+        assert bool(make(**settings).drives.loop.memory.arrays.delays.size) == compensated
 
 
 @pytest.mark.parametrize(
