@@ -165,7 +165,9 @@ def draw_case(drawn: Any, key: Any, episode: Any) -> Any:
 
 
 @compiled_internal
-def begin_next(i: int, envs: EnvArrays, conditions: Any, drawn: Any, given: Array) -> None:
+def begin_next(
+    i: int, envs: EnvArrays, conditions: ConditionArrays | None, drawn: Any, given: Array
+) -> None:
     """Begin the next episode of environment i, with a path and a vehicle that are drawn."""
     draws = envs.draws[i]
     draws[1] += np.uint64(1)
@@ -207,8 +209,8 @@ def integrate_block(envs: EnvArrays, commands: Array, low: int, lanes: int, b: A
 
 @compiled
 def advance(
-    first: int, last: int, mode: int, envs: EnvArrays, conditions: Any, step: StepArrays,
-    drawn: Any, given: Array, b: Array,
+    first: int, last: int, mode: int, envs: EnvArrays, conditions: ConditionArrays | None,
+    step: StepArrays, drawn: Any, given: Array, b: Array,
 ) -> None:  # fmt: skip
     """Drive the environments `first` to `last` - 1 one control period, with autoreset.
 
@@ -218,7 +220,7 @@ def advance(
     Parameters
     ----------
     conditions
-        `ConditionArrays`, or None: numba compiles one version for each.
+        None under "simulation"; numba compiles a version for each type.
     drawn, given
         As `draw_case` and `episodes.begin` take them, for the episodes that begin.
     b
@@ -265,12 +267,13 @@ def advance(
 
 @compiled_parallel
 def advance_in_threads(
-    chunks: int, n: int, mode: int, envs: EnvArrays, conditions: Any, step: StepArrays,
-    drawn: Any, given: Array, scratch: Array,
+    chunks: int, n: int, mode: int, envs: EnvArrays, conditions: ConditionArrays | None,
+    step: StepArrays, drawn: Any, given: Array, scratch: Array,
 ) -> None:  # fmt: skip
-    """`advance` on all n environments, in chunks of whole blocks that threads share.
+    """`advance` on all n environments, in chunks that threads share.
 
-    Each chunk has its own row of `scratch`.
+    Chunks consist of whole blocks, or of single vehicles under conditions; each chunk has its own
+    row of `scratch`.
     """
     size = LANES
     if conditions is not None:
@@ -283,7 +286,9 @@ def advance_in_threads(
 
 
 @compiled
-def begin_all(mask: Array, envs: EnvArrays, conditions: Any, drawn: Any, given: Array) -> None:
+def begin_all(
+    mask: Array, envs: EnvArrays, conditions: ConditionArrays | None, drawn: Any, given: Array
+) -> None:
     """Begin the next episode of every environment that `mask` (n,) marks."""
     for i in range(mask.shape[0]):
         if mask[i]:
