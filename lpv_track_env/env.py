@@ -221,7 +221,11 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             return
         self.task, self._plant = task, plant
         self._constants[:] = task.constants()
-        self._conditioned = ConditionedVehicle.of(task)
+        self._conditioned = None
+        if task.conditions is not None:
+            self._conditioned = ConditionedVehicle.of(
+                task.conditions, task.vehicle, task.control_period
+            )
         self._take_table(task.path.table)
 
     def _plant_of(self, task: Task) -> PlantEpisode | None:

@@ -187,7 +187,9 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             rows=np.array(rows),
         )
         if self._conditions is not None:
-            specs = [layout.spec_of(task) for task in tasks]
+            given = tasks[0].conditions
+            assert given is not None
+            specs = [layout.spec_of(given, task.vehicle, task.control_period) for task in tasks]
             self._conditions = self._conditions._replace(specs=np.stack(specs))
 
     def task_of(self, index: int) -> Task:

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from lpv_track_env import kernels
 from lpv_track_env.conditions import DRAWN, ESTIMATORS, LONGEST_DELAY, Conditions
 from lpv_track_env.estimation import filter as filtering
-from lpv_track_env.task import Task
-from lpv_track_env.vehicle import PARAMETER_ORDER
+from lpv_track_env.vehicle import PARAMETER_ORDER, VehicleParameters
 from trajectories.compilation import compiled_internal
 
 Array = NDArray[np.float64]
@@ -111,10 +110,8 @@ def vehicle_size(conditions: Conditions, period: float) -> int:
     return TAIL + COMMAND * commands + FIX * fixes + filtering.FILTER + filtering.NODE * nodes
 
 
-def spec_of(task: Task) -> Array:
-    """Return the spec of a task under conditions, shape (SPEC,)."""
-    conditions, period = task.conditions, task.control_period
-    assert conditions is not None
+def spec_of(conditions: Conditions, vehicle: VehicleParameters, period: float) -> Array:
+    """Return the spec of a vehicle under some conditions and a control period (s), (SPEC,)."""
     age = conditions.max_command_age
     commands, fixes, _ = capacities(conditions, period)
     return np.concatenate(
@@ -130,7 +127,7 @@ def spec_of(task: Task) -> Array:
                 fixes,
             ],
             conditions.filter_settings.initial_variances,
-            conditions.filter_settings.as_array(task.vehicle),
+            conditions.filter_settings.as_array(vehicle),
         ]
     )
 
@@ -144,13 +141,13 @@ class ConditionedVehicle(NamedTuple):
     """Scratch of the filter, (`filter.WORK`,)."""
 
     @classmethod
-    def of(cls, task: Task) -> "ConditionedVehicle | None":
-        """Return new arrays for a task; None under conditions `simulation`."""
-        if task.conditions is None:
-            return None
+    def of(
+        cls, conditions: Conditions, vehicle: VehicleParameters, period: float
+    ) -> "ConditionedVehicle":
+        """Return new arrays for a vehicle under some conditions and a control period (s)."""
         return cls(
-            np.zeros(vehicle_size(task.conditions, task.control_period)),
-            spec_of(task),
+            np.zeros(vehicle_size(conditions, period)),
+            spec_of(conditions, vehicle, period),
             np.zeros(filtering.WORK),
         )
 
