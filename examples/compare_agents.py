@@ -6,6 +6,7 @@ from collections import defaultdict
 import numpy as np
 from scipy.stats import t as student
 
+from experiments.run.case import run_case, worker_death
 from experiments.run.engines import local_pool
 
 
@@ -30,7 +31,7 @@ def main() -> None:
         for seed in range(options.seeds)
     ]
     values: dict[str, list[float]] = defaultdict(list)
-    for result in local_pool(specs, options.workers):
+    for result in local_pool(specs, options.workers, run_case, worker_death):
         if result["status"] != "ok":
             raise SystemExit(f"{result['agent']}, seed {result['seed']}: {result['error']}")
         values[result["agent"]].append(result["metrics"]["ale"])
