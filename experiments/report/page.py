@@ -278,7 +278,7 @@ def _table(
 
     def cell(place: int, content: Cell, tag: str, scope: str = "") -> str:
         text, small = content if isinstance(content, tuple) else (content, "")
-        remark = f" <small>{html.escape(small)}</small>" if small else ""
+        remark = f"<small>{html.escape(small)}</small>" if small else ""
         mark = f' class="{kinds[place]}"' if place in kinds else ""
         return f"<{tag}{scope}{mark}>{html.escape(text)}{remark}</{tag}>"
 
