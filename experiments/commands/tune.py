@@ -30,7 +30,7 @@ PACKAGES = {
     "catalogue": ("rl", "stable_baselines3"),
     "rl": ("rl", "stable_baselines3"),
 }
-"""Extra that a method needs, and the package that it is checked by."""
+"""Extra that a method needs, and the package whose absence shows that it is missing."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -1,1 +1,1 @@
-"""What trainings and tunings share: resumable jobs, checkpoints, paths and seeds."""
+"""Shared parts of trainings and tunings: resumable jobs, checkpoints, paths and seeds."""

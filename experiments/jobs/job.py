@@ -50,7 +50,7 @@ class Listener:
 
 
 class Job(ABC):
-    """A computation in steps; `lines` are those of the steps done so far."""
+    """A computation in steps; `lines` has the progress line of every step so far."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -63,10 +63,10 @@ class Job(ABC):
 
     @abstractmethod
     def step(self) -> Line:
-        """Run one step; return what its line tells, but for `seconds`."""
+        """Run one step; return the entries of its line, except `seconds`."""
 
     def conclude(self, line: Line) -> Line:
-        """Evaluate what a step came to, outside the time in its line; return the whole line."""
+        """Complete the line of a step; the time that this takes counts in the next line only."""
         return line
 
     @abstractmethod
@@ -101,9 +101,9 @@ def run_job(
     began = time.perf_counter()
     with Interrupts() as interrupts:
         while not job.done:
-            told = job.step()
+            entries = job.step()
             interrupts.check()
-            line = job.conclude({**told, "seconds": before + time.perf_counter() - began})
+            line = job.conclude({**entries, "seconds": before + time.perf_counter() - began})
             interrupts.check()
             job.lines.append(line)
             # A job that is killed between these two resumes from the state before the line.

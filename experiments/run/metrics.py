@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 BANDS = CurvatureBands()
 """Straight, gentle, moderate, sharp."""
+KEPT = 1e-3
+"""Largest excess, in a constraint's unit, that does not count as a violation."""
 
 
 def rms(time: Array, values: Array) -> float:
@@ -158,7 +160,7 @@ def violations(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) ->
     result = {}
     for name, excess in excesses.items():
         result[f"excess_{name}"] = float(max(excess.max(initial=0.0), 0.0))
-        result[f"violated_{name}"] = float(np.mean(excess > 1e-3)) if excess.size else 0.0
+        result[f"violated_{name}"] = float(np.mean(excess > KEPT)) if excess.size else 0.0
     return result
 
 

@@ -1,7 +1,8 @@
 """Statistics of few trainings: interquartile means, bootstrap intervals, paired gains.
 
 Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice", NeurIPS 34,
-2021: aggregate by the interquartile mean, and say how sure it is by resampling what is random.
+2021: aggregate by the interquartile mean, with intervals from resampling. Rates have exact binomial
+intervals.
 """
 
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate and its interval."""
+    """Estimate of a quantity with its 95 % interval."""
 
     value: float
     low: float
@@ -27,16 +28,16 @@ class Interval:
 
 
 def interquartile_mean(values: Array, axis: int = 0) -> Any:
-    """Mean of the middle half along an axis: a quarter of the values cut off at each end."""
+    """Return the mean of the middle half of the values along an axis."""
     return trim_mean(values, 0.25, axis=axis)
 
 
 def paired_gain(ours: Array, theirs: Array, *, seed: int = 0) -> Interval:
-    """Share by which our mean score is below theirs, over trainings and drives.
+    """Estimate the share by which our mean score is below theirs.
 
-    Each training's gain is 1 - mean(ours) / mean(theirs) on the same drives; the estimate is the
-    interquartile mean over trainings. The bootstrap draws trainings and paths, with replacement: a
-    path's drives belong together.
+    The gain of a training is 1 - mean(ours) / mean(theirs) on the same drives; the estimate is the
+    interquartile mean over trainings. The bootstrap draws trainings and paths with replacement;
+    the drives of a path stay together.
 
     Parameters
     ----------
@@ -44,7 +45,7 @@ def paired_gain(ours: Array, theirs: Array, *, seed: int = 0) -> Interval:
         Scores, (trainings, paths, drives); training i of one is compared with training i of the
         other, drive by drive.
     seed
-        Of the resampling.
+        Seed of the resampling.
     """
     if ours.shape != theirs.shape or ours.ndim != 3:
         raise ValueError(f"scores must be alike in shape, not {ours.shape} and {theirs.shape}")
@@ -55,24 +56,27 @@ def paired_gain(ours: Array, theirs: Array, *, seed: int = 0) -> Interval:
         gains: Array = 1.0 - a.mean(axis=-1) / b.mean(axis=-1)
         return gains
 
-    value = float(interquartile_mean(gain(a, b)))
     blocks = _resampled(trainings, paths, seed)
     drawn = interquartile_mean(gain(a[blocks], b[blocks]), axis=1)
+    return _interval(float(interquartile_mean(gain(a, b))), drawn)
+
+
+def mean_interval(scores: Array, *, seed: int = 0) -> Interval:
+    """Estimate the interquartile mean over trainings of mean scores (trainings, paths, drives)."""
+    means = scores.mean(axis=2)
+    trainings, paths = means.shape
+    drawn = interquartile_mean(means[_resampled(trainings, paths, seed)].mean(axis=2), axis=1)
+    return _interval(float(interquartile_mean(means.mean(axis=1))), drawn)
+
+
+def _interval(value: float, drawn: Array) -> Interval:
+    """Return an estimate with the quantiles of its resamples."""
     low, high = np.quantile(drawn, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2])
     return Interval(value, float(low), float(high))
 
 
-def mean_interval(scores: Array, *, seed: int = 0) -> Interval:
-    """Interquartile mean over trainings of mean scores (trainings, paths, drives), bootstrapped."""
-    means = scores.mean(axis=2)
-    trainings, paths = means.shape
-    drawn = interquartile_mean(means[_resampled(trainings, paths, seed)].mean(axis=2), axis=1)
-    low, high = np.quantile(drawn, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2])
-    return Interval(float(interquartile_mean(means.mean(axis=1))), float(low), float(high))
-
-
 def _resampled(trainings: int, paths: int, seed: int) -> tuple[Array, Array]:
-    """Trainings (resamples, trainings, 1) and paths (resamples, 1, paths), with replacement."""
+    """Draw trainings (resamples, trainings, 1) and paths (resamples, 1, paths)."""
     random = np.random.default_rng(seed)
     rows = random.integers(trainings, size=(RESAMPLES, trainings, 1))
     return rows, random.integers(paths, size=(RESAMPLES, 1, paths))

@@ -21,12 +21,11 @@ import trajectories
 from experiments.run import published
 from experiments.run.case import Case
 from experiments.run.learning_cost import words
+from experiments.run.metrics import KEPT
+from experiments.run.statistics import CONFIDENCE
 
 Result = Mapping[str, Any]
 
-CONFIDENCE = 0.95
-KEPT = 1e-3
-"""Largest excess, in a constraint's unit, that does not count as a violation (as in `metrics`)."""
 UNITS = {
     "speed": "m/s",
     "lateral_velocity": "m/s",

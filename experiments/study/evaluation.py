@@ -15,7 +15,7 @@ from agents.weight_tuning.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.decision import Decider
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import PARTS, SCALES, failed, parts_of, scores_of
-from experiments.run.metrics import BANDS
+from experiments.run.metrics import BANDS, KEPT
 from experiments.run.suites import HELD_OUT, RAW, RAW_PREVIEW, SIX
 from experiments.tuning.tuner import Result, threads
 from lpv_track_env import kernels as k
@@ -27,8 +27,6 @@ from trajectories.importers import read_racetrack
 
 Array = NDArray[Any]
 
-KEPT = 1e-3
-"""A constraint broken by no more than this counts as kept, as in `experiments.run.metrics`."""
 IN_BANDS = tuple(f"in_{name}" for name in BANDS.names)
 """Names of the scores of the periods in each band of |curvature| at the foot point."""
 FIGURES = (

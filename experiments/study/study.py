@@ -61,7 +61,7 @@ class Rung:
 
     @property
     def baseline(self) -> str:
-        """Label of the rung it is compared with: the best fixed set under the same conditions."""
+        """Label of the rung to compare with: the best fixed set under the same conditions."""
         return f"{BASELINE}, simulation" if self.conditions == "simulation" else BASELINE
 
     def settings(self, seed: int, solves: int) -> TuningSettings:

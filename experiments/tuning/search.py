@@ -261,7 +261,7 @@ class GradientSearch(Search):
         """Return the gradient (rows * entries,) from the scores of the last candidates."""
         values = np.asarray(scores).reshape(self.pairs, 2)
         slopes = (values[:, 0] - values[:, 1]) / (2.0 * self.settings.hyperparameters["sigma"])
-        # A failed drive tells that a side is bad, but not how steep the score is.
+        # A failed drive shows that a side is bad, but not how steep the score is.
         gradient: Array = np.clip(slopes, -2.0, 2.0) @ self._directions / self.pairs
         return gradient
 
