@@ -21,7 +21,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +33,7 @@ from trajectories.path import SPACING, ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
 
 Array = NDArray[np.float64]
+Fit = TypeVar("Fit")
 Derivatives: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 """x, y, their first and their second derivatives, each (n,)."""
 
@@ -353,19 +354,30 @@ def _penalised(points: Array, at: Array, tolerance: float, closed: bool) -> BSpl
         residual = basis @ control - (points - centre)
         return control, float(np.sqrt(np.mean((residual**2).sum(axis=1))))
 
-    low, high = PENALTY_EXPONENTS
-    if solve(high)[1] <= tolerance:
-        low = high
-    while high - low > PENALTY_RESOLUTION:
-        middle = 0.5 * (low + high)
-        if solve(middle)[1] <= tolerance:
-            low = middle
-        else:
-            high = middle
-    control = solve(low)[0] + centre
+    control = largest_penalty(solve, tolerance, PENALTY_EXPONENTS) + centre
     if closed:
         control = np.vstack([control, control[:DEGREE]])
     return BSpline(knots, control, DEGREE)
+
+
+def largest_penalty(
+    fit: Callable[[float], tuple[Fit, float]], tolerance: float, exponents: tuple[float, float]
+) -> Fit:
+    """Return the fit with the largest penalty on roughness that keeps a tolerance, by bisection.
+
+    `fit` returns a fit and its rms deviation, which grows with the penalty, from the penalty's
+    power of ten. The smallest penalty is taken if none keeps the tolerance.
+    """
+    low, high = exponents
+    if fit(high)[1] <= tolerance:
+        low = high
+    while high - low > PENALTY_RESOLUTION:
+        middle = 0.5 * (low + high)
+        if fit(middle)[1] <= tolerance:
+            low = middle
+        else:
+            high = middle
+    return fit(low)[0]
 
 
 def from_geometry(

@@ -18,7 +18,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from experiments.cli import parser
-from experiments.report.appendix import ERRATA
+from experiments.report.build import ERRATA
 
 with warnings.catch_warnings():
     # It finds its font by a function that Python 3.11 deprecated, and 3.13 took back into favour.

@@ -85,7 +85,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     write_atomically(file, json.dumps(result, indent=1).encode())
     draw(result, options.out / "ablation.png")
     console.print(table(result))
-    console.print(f"written: {file}, ablation.png", markup=False, highlight=False, soft_wrap=True)
+    console.out(f"written: {file}, ablation.png", highlight=False)
     return 0
 
 

@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from experiments.commands.options import (
+    add_agent_settings,
     add_conditions,
     add_out,
     add_seed,
-    add_settings,
     add_vehicle,
     agent_settings,
     conditions_of,
@@ -37,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("--trajectory", default="T2", metavar="NAME")
     parser.add_argument("--agent", default="lpv-nmpc", metavar="NAME", help="or file.py:Class")
-    add_settings(parser, "--agent-set")
+    add_agent_settings(parser)
     add_vehicle(parser)
     add_conditions(parser, "realtime", "realtime, ideal or simulation")
     parser.add_argument(
@@ -82,11 +83,11 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from experiments.parallel.recording import summarise
 
     file = options.out / RUN_FILE
-    result = {"format": FORMAT, **measured_on(), "settings": setup.as_dict()}
+    result = {"format": FORMAT, **measured_on(), "settings": asdict(setup)}
     _write(result, file)
 
     def say(line: str) -> None:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.out(line, highlight=False)
         console.file.flush()
 
     outcome = supervisor.run(setup, say)

@@ -74,11 +74,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
         save_figure(figure, folder / "speed.png")
     show(result, console)
     complete = result["complete"]
-    console.print(
-        f"{'every round' if complete else 'interrupted; what was measured'}: "
-        f"{folder / 'speed.json'}",
-        markup=False, highlight=False, soft_wrap=True,
-    )  # fmt: skip
+    measured = "every round" if complete else "interrupted; what was measured"
+    console.out(f"{measured}: {folder / 'speed.json'}", highlight=False)
     return 0 if complete else EXIT_INTERRUPTED
 
 

@@ -120,7 +120,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     }  # fmt: skip
     file = options.out / "verify.json"
     write_atomically(file, json.dumps(content, indent=1, allow_nan=False).encode())
-    console.print(f"written: {file}", markup=False, highlight=False, soft_wrap=True)
+    console.out(f"written: {file}", highlight=False)
     for line in missed:
         console.print(f"fell short: {line}", markup=False, highlight=False, style="red")
     return 1 if missed else 0

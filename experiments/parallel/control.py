@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import agents
 from agents import Agent
 from agents.base import stopping_acceleration
 from experiments.parallel.child_processes import ATTACHED, READY, Link, quiet
@@ -59,7 +60,7 @@ def control(link: Link, setup: Setup, estimates: Reader, commands: Writer) -> No
 def prepared(setup: Setup) -> "Controller":
     """Return a controller whose agent has been called, so that everything is compiled."""
     env = setup.task_env()
-    agent = setup.make_agent(env)
+    agent = agents.make(setup.agent, env, **setup.agent_settings)
     observer = PathObserver(env.path, env.layout)
     path = env.path
     state = np.array([path.speed[0], 0.0, path.heading[0], 0.0, path.x[0], path.y[0]])

@@ -2,14 +2,12 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from experiments.figures import COLOURS
+from experiments.figures import COLOURS, plain_ticks
 from experiments.parallel.recording import Driven, Outcome, Recording, Summary
 from experiments.parallel.setup import STALE_PERIODS, Setup
 from lpv_track_env.bicycle import VX, X, Y
@@ -109,7 +107,7 @@ def _latencies(ax: Axes, setup: Setup, recording: Recording) -> None:
         ax.plot(time, 1e3 * applied[name], ".", markersize=2, label=label, color=colour)
     ax.axhline(1e3 * setup.period, color="black", linewidth=0.8, label="control period")
     ax.set_yscale("log")
-    _plain(ax.yaxis)
+    plain_ticks(ax.yaxis, (1.0,))
     ax.set_xlabel("time, s")
     ax.set_ylabel("ms after the sample was due")
     ax.legend(fontsize="small", markerscale=4)
@@ -129,18 +127,12 @@ def _distribution(ax: Axes, setup: Setup, recording: Recording) -> None:
     ax.axvline(1e3 * setup.period, color="black", linewidth=0.8, label="control period")
     ax.set_xscale("log")
     ax.set_yscale("log")
-    _plain(ax.xaxis)
-    _plain(ax.yaxis)
+    plain_ticks(ax.xaxis, (1.0,))
+    plain_ticks(ax.yaxis, (1.0,))
     ax.set_xlabel("ms")
     ax.set_ylabel("share of periods that took longer")
     ax.legend(fontsize="small")
     ax.grid(visible=True, alpha=0.3)
-
-
-def _plain(axis: Axis) -> None:
-    """Label a logarithmic axis with plain numbers, at powers of ten only."""
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(NullFormatter())
 
 
 def _errors(ax: Axes, outcome: Outcome, driven: Driven) -> None:

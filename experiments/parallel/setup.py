@@ -7,16 +7,15 @@ all processes share.
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-import agents
 import trajectories
 from agents.registry import check_settings
 from lpv_track_env import vehicle
-from lpv_track_env.conditions import IDEAL, Conditions, load
+from lpv_track_env.conditions import IDEAL, SIMULATION, Conditions, load
 from lpv_track_env.env import PathTrackingEnv
 from trajectories.naming import choose
 
@@ -90,11 +89,6 @@ REASONS = ("driving", "stale estimate", "no fix", "estimate not finite", "failed
 
 STALE_PERIODS = 3
 """Age in control periods at which an estimate, or a command based on it, is stale."""
-
-
-def undelayed(conditions: Conditions) -> Conditions:
-    """Remove the simulated computing delay: the processes of a run have a real one."""
-    return conditions.replace(computing_delay=0.0)
 
 
 @dataclass(frozen=True)
@@ -193,22 +187,19 @@ class Setup:
         """Conditions as an object, `IDEAL` for the simulation."""
         return load(self.conditions) or IDEAL
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
     def task_env(self) -> PathTrackingEnv:
-        """Return an environment with the path, vehicle, period, preview and known delays."""
+        """Return an environment with the path, vehicle, period, preview and known delays.
+
+        It simulates no computing delay: the processes of a run have a real one.
+        """
         conditions = load(self.conditions)
         return PathTrackingEnv(
             self.trajectory,
             self.vehicle,
-            conditions="simulation" if conditions is None else undelayed(conditions),
+            conditions=SIMULATION
+            if conditions is None
+            else conditions.replace(computing_delay=0.0),
             control_period=self.period,
             preview_steps=PREVIEW_STEPS,
             preview_period=PREVIEW_PERIOD,
         )
-
-    def make_agent(self, env: PathTrackingEnv) -> agents.Agent:
-        """Return the agent that drives."""
-        return agents.make(self.agent, env, **self.agent_settings)

@@ -16,7 +16,6 @@ from experiments.parallel.setup import (
     STEP,
     WHEEL_MS,
     Setup,
-    undelayed,
 )
 from lpv_track_env.bicycle import PSI, VX, YAW_RATE, X, Y
 from lpv_track_env.conditions import IDEAL, SIMULATION, Conditions, load, sensors
@@ -49,8 +48,8 @@ def plant_conditions(setup: Setup) -> Conditions | str:
     conditions = load(setup.conditions)
     if conditions is None:
         return SIMULATION
-    return undelayed(conditions).replace(
-        estimator="truth", max_fix_age=FOR_EVER, max_command_age=FOR_EVER
+    return conditions.replace(
+        computing_delay=0.0, estimator="truth", max_fix_age=FOR_EVER, max_command_age=FOR_EVER
     )
 
 

@@ -1,6 +1,7 @@
 """Read ROS 1 and ROS 2 bags of any origin into plain arrays."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -239,19 +240,15 @@ def _check_layout(file: Path, connection: Any, ros: int) -> None:
 
 def _info(file: Path, reader: Any, ros: int, storage: str) -> BagInfo:
     """Return the index of an opened bag."""
-    topics = sorted(
-        (str(name), str(connection.msgtype), int(connection.msgcount))
-        for name, topic in reader.topics.items()
-        for connection in topic.connections
-    )
-    merged: dict[tuple[str, str], int] = {}
-    for name, message_type, count in topics:
-        merged[name, message_type] = merged.get((name, message_type), 0) + count
-    empty = not sum(merged.values())
+    counts: Counter[tuple[str, str]] = Counter()
+    for name, topic in reader.topics.items():
+        for connection in topic.connections:
+            counts[str(name), str(connection.msgtype)] += int(connection.msgcount)
+    empty = not counts.total()
     return BagInfo(
         file, ros, storage,
         0 if empty else int(reader.start_time), 0 if empty else int(reader.end_time) - 1,
-        tuple(TopicInfo(*key, count) for key, count in merged.items()),
+        tuple(TopicInfo(*key, count) for key, count in sorted(counts.items())),
     )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from experiments.ros.read import BagError, Reading, info, read
 from experiments.ros.topics import Datum, Fixes, GeoPoint, Odometry
 from trajectories.importers import IMPORT_LIMITS, MAX_STEERING_ANGLE, self_approach
 from trajectories.path import ReferencePath
-from trajectories.shapes import Geometry, from_geometry, smooth
+from trajectories.shapes import Geometry, from_geometry, largest_penalty, smooth
 from trajectories.speed import SpeedLimits
 
 Array = NDArray[np.float64]
@@ -42,8 +42,7 @@ FEWEST_POSITIONS, SHORTEST = 8, 5.0
 LONGEST_GAP = 2.0
 """Longest time without a position before a warning, s."""
 PENALTIES = (-12.0, 8.0)
-PENALTY_RESOLUTION = 0.05
-"""Range and resolution of the bisection for a smoothing penalty, in powers of ten."""
+"""Powers of ten between which the smoothing penalty is bisected."""
 
 
 @dataclass(frozen=True)
@@ -234,16 +233,7 @@ def _smoothed(time: Array, points: Array, tolerance: float | None) -> tuple[BSpl
         squares = (x(time) - points[:, 0]) ** 2 + (y(time) - points[:, 1]) ** 2
         return (x, y), float(np.sqrt(np.mean(squares)))
 
-    low, high = PENALTIES
-    if fit(high)[1] <= tolerance:
-        low = high
-    while high - low > PENALTY_RESOLUTION:
-        middle = 0.5 * (low + high)
-        if fit(middle)[1] <= tolerance:
-            low = middle
-        else:
-            high = middle
-    return fit(low)[0]
+    return largest_penalty(fit, tolerance, PENALTIES)
 
 
 def _resampled(splines: tuple[BSpline, BSpline], time: Array) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ import pytest
 
 from experiments import cli
 from experiments.cli import parser
-from experiments.report.appendix import ERRATA
+from experiments.report.build import ERRATA
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -8,8 +8,7 @@ import matplotlib.image as mpimg
 import pytest
 
 from experiments import cli
-from experiments.commands import ablation
-from experiments.parallel import latency
+from experiments.commands import ablation, latency
 from experiments.run.computing import ARRANGEMENTS
 from lpv_track_env.conditions import DRAWN, IDEAL, REALTIME
 

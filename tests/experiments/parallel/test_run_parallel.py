@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -133,7 +134,7 @@ def test_a_run_to_its_end() -> None:
 @pytest.mark.parametrize("role", ["estimator", "controller"])
 def test_a_killed_process_brakes_the_vehicle_and_ends_the_run(role: str, capsys) -> None:
     saboteur = Saboteur(role, signal.SIGKILL)
-    setup = Setup(**{**SLOW.as_dict(), "seconds": 20.0})
+    setup = replace(SLOW, seconds=20.0)
     outcome = drive(setup, saboteur)
     assert outcome.end == "fault"
     assert outcome.fault == f"the {role} was killed by SIGKILL"
@@ -144,7 +145,7 @@ def test_a_killed_process_brakes_the_vehicle_and_ends_the_run(role: str, capsys)
 
 
 def test_a_hung_solver_is_found_by_the_watchdog() -> None:
-    setup = Setup(**{**SLOW.as_dict(), "agent": f"{AGENTS}:Hangs", "watchdog": 20, "seconds": 20.0})
+    setup = replace(SLOW, agent=f"{AGENTS}:Hangs", watchdog=20, seconds=20.0)
     outcome = drive(setup, Saboteur())
     assert outcome.end == "fault"
     assert re.fullmatch(r"the controller hangs: no command for \d+\.\d\d s", outcome.fault)

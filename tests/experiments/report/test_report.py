@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.report import sideslip, svg_charts
-from experiments.report.appendix import ERRATA
-from experiments.report.build import write_report
+from experiments.report.build import ERRATA, write_report
 from experiments.report.drives import reference_path, usable
 from experiments.report.page import line_styles
 from experiments.run import published, tables
