@@ -8,6 +8,7 @@ drive: in SB3's `evaluate_policy`, in this project's rollouts and in its reports
 import math
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sized
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
@@ -24,6 +25,7 @@ from trajectories import ReferencePath
 
 Action = NDArray[np.float32]
 Memory = TypeVar("Memory")
+BatchMemory = TypeVar("BatchMemory", bound=Sized)
 
 CHECKPOINTS = Path(__file__).parent / "checkpoints"
 """Folder of the policies that come with this project: NAME.json for the agent NAME."""
@@ -188,6 +190,25 @@ def observation_rows(observation: NDArray[Any], size: int) -> NDArray[np.float64
     return rows
 
 
+def batch_memory(
+    memory: BatchMemory | None,
+    rows: int,
+    episode_start: NDArray[np.bool_] | None,
+    new: Callable[[int], BatchMemory],
+) -> tuple[BatchMemory, NDArray[np.bool_]]:
+    """Return the memory of a batch, and a mask (rows,) of those in which an episode begins.
+
+    Without a memory, or with one of another number of rows, a new one begins in all of them.
+    """
+    starts = np.zeros(rows, dtype=np.bool_)
+    if episode_start is not None:
+        starts[:] = episode_start
+    if memory is None or len(memory) != rows:
+        memory = new(rows)
+        starts[:] = True
+    return memory, starts
+
+
 class TrackingAgent(ABC, Generic[Memory]):
     """Base class of agents that are written as `control`, for one vehicle and one observation.
 
@@ -222,8 +243,8 @@ class TrackingAgent(ABC, Generic[Memory]):
     def diagnostics(self, memory: Memory) -> dict[str, Any]:  # noqa: ARG002  for subclasses
         """Return details of the last step for one vehicle; empty if there are none.
 
-        Known entries: status, seconds, iterations, cost, slack (3,), fallback, weights (10,),
-        plan (n, 2) in the frame of the path's foot point.
+        Known entries: status, seconds, iterations, cost, slack (3,), fallback, weights (10,) Q, S,
+        R in use, plan (N + 1, 2) of predicted positions in the frame of the path's foot point.
         """
         return {}
 

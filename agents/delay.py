@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.base import Action, Agent, DrivingTask
+from agents.base import Action, Agent, DrivingTask, batch_memory
 from agents.reference import (
     NODE,
     NODE_ARC_LENGTH,
@@ -356,18 +356,12 @@ class DelayCompensated:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Action, DelayMemory]:
-        """Return the action (2,) of an observation (size,), or those of a batch, and the memory."""
+        """Return the action (2,) for one observation (size,), or (n, 2) for a batch; and memory."""
         given = np.asarray(observation)
         rows = np.array(np.atleast_2d(given), dtype=np.float64, order="C")
         self.task.layout.unpack(rows)
-        n = len(rows)
-        memory = self._memory if state is None else state
-        starts = np.zeros(n, dtype=np.bool_)
-        if episode_start is not None:
-            starts |= np.broadcast_to(np.asarray(episode_start, dtype=bool), (n,))
-        if memory is None or len(memory) != n:
-            memory = self.future.memory(n)
-            starts[:] = True
+        kept = self._memory if state is None else state
+        memory, starts = batch_memory(kept, len(rows), episode_start, self.future.memory)
         if state is None:
             self._memory = memory
         self.future.predict(rows, starts, memory)

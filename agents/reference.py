@@ -158,7 +158,7 @@ def point_at(
 def mean_curvature(reference: LocalReference, start: float, end: float) -> float:
     """Return the mean curvature (1/m) of one reference between two arc lengths (m).
 
-    Of a stretch that reaches beyond the preview, the part within the preview is used.
+    A stretch that reaches beyond the preview is cut at its end.
     """
     first, last = float(reference.arc_length[0]), float(reference.arc_length[-1])
     # At least a centimetre long, even at the end of the preview.

@@ -37,7 +37,7 @@ class AdapterVecEnv(VecEnv):
     observation_space, action_space
         Spaces of a single environment.
     monitored
-        Whether infos have the entry `episode`, as those of SB3's `Monitor`.
+        True if infos have the entry `episode`, as with SB3's `Monitor`.
     """
 
     def __init__(

@@ -53,7 +53,7 @@ class LearnedPolicy:
         self._size = task.layout.size
         self._network = Network.of(self.policy, *task.action_bounds)
         self._base = RtiNmpc(task) if self.policy.origin == "lpv-nmpc" else None
-        # With zero rows: compile here, if need be, not in the first control period.
+        # Called with zero rows to trigger compilation here, not in the first control period.
         self._network.act(np.zeros((0, self._size)), np.zeros((0, ACTIONS)))
 
     def predict(

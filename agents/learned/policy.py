@@ -66,7 +66,7 @@ class Policy:
         u      = squash(W_L x + b_L)                        in [-1, 1]
         action = base + centre + half u                     [a m/s^2, delta rad]
 
-    and the action is clipped to the vehicle's range.
+    and the action is clipped to the vehicle's range. Arrays are copied and read-only.
 
     Parameters
     ----------
@@ -94,8 +94,6 @@ class Policy:
     symmetric
         Use the mean of the network's output and of its mirrored output for the mirrored
         observation as u: the policy then treats left and right alike.
-
-    Arrays are copied and read-only.
 
     Raises
     ------
@@ -131,7 +129,12 @@ class Policy:
         centre, half = (_action(name, getattr(self, name)) for name in ("centre", "half"))
         if half.min() < 0.0:
             raise ValueError(f"half must not be negative, but is {half.tolist()}")
-        _check_symmetry(self.symmetric, centre)
+        if not isinstance(self.symmetric, bool):
+            raise ValueError(  # noqa: TRY004  one type of error for all fields
+                f"symmetric must be true or false, not {self.symmetric!r}"
+            )
+        if self.symmetric and centre[1] != 0.0:
+            raise ValueError(f"a symmetric policy steers about 0, not about {centre[1]} rad")
         weight, bias = checked_layer("feature", self.feature_weight, self.feature_bias, self.inputs)
         layers = checked_layers(self.layers, len(bias), ACTIONS, "for a and delta")
         normal = {
@@ -260,13 +263,6 @@ def checked_name(algorithm: object) -> str:
     if not isinstance(algorithm, str) or not algorithm.strip():
         raise ValueError(f"algorithm must be a name, not {algorithm!r}")
     return algorithm
-
-
-def _check_symmetry(symmetric: object, centre: Array) -> None:
-    if not isinstance(symmetric, bool):
-        raise ValueError(f"symmetric must be true or false, not {symmetric!r}")  # noqa: TRY004
-    if symmetric and centre[1] != 0.0:
-        raise ValueError(f"a symmetric policy steers about 0, not about {centre[1]} rad")
 
 
 def checked_number(name: str, value: Any) -> float:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.base import DrivingTask, TrackingAgent
+from agents.base import DrivingTask, TrackingAgent, blind_control
 from agents.classical.geometric import Stanley
 from agents.nmpc.problem import NmpcProblem
 from agents.nmpc.schedule import Switching
@@ -192,8 +192,7 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
     ) -> tuple[float, float]:
         """Compute inputs (a, delta) in place of a failed solve.
 
-        The last plan's next input while the plan lasts, else those of Stanley's controller; after
-        `max_failures` failures in a row, braking to a stop with Stanley's steering.
+        The class says what replaces it when.
 
         Parameters
         ----------
@@ -218,7 +217,7 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
         stage = int(age * self.task.control_period / self.problem.period + 1e-9)
         if failures > self.max_failures:
             fallback.used = "stop"
-            a, _ = super().control_blind(observation, None)  # type: ignore[arg-type]
+            a, _ = blind_control(self.task.vehicle, observation)
         elif plan is not None and stage < len(plan):
             fallback.used = "plan"
             a, delta = (float(value) for value in plan[stage])

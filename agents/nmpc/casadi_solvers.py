@@ -198,19 +198,19 @@ class _NlpSolver(ABC):
         self, solver: ca.Function, guess: dict[str, Array], parameters: Array, began: float
     ) -> tuple[Solution, Any]:
         if not np.isfinite(parameters).all():
-            return Solution(Status.NAN, None, None, None, np.nan, 0, 0.0), None
+            return Solution(Status.NAN), None
         try:
             result = solver(p=parameters, **self._bounds, **guess)
             statistics = solver.stats()
         except RuntimeError:
             seconds = time.perf_counter() - began
-            return Solution(Status.QP_FAILURE, None, None, None, np.nan, 0, seconds), None
+            return Solution(Status.QP_FAILURE, seconds=seconds), None
         seconds = time.perf_counter() - began
         iterations, cost = int(statistics["iter_count"]), float(result["f"])
         groups = np.asarray(result["x"]).reshape(self.problem.horizon, self.GROUP)
         status = self._status(statistics)
         if status is Status.NAN or not (np.isfinite(groups).all() and np.isfinite(cost)):
-            return Solution(Status.NAN, None, None, None, np.nan, iterations, seconds), None
+            return Solution(Status.NAN, iterations=iterations, seconds=seconds), None
         states = np.vstack([parameters[:STATES], groups[:, self.STATE]])
         inputs, slack = groups[:, self.INPUT[0]].copy(), groups[:, self.SLACK]
         plan = Solution(status, inputs, states, slack, cost, iterations, seconds)
@@ -340,6 +340,10 @@ class FatropSolver(_NlpSolver):
     s_i is the slack on vx'(x_i, u_i), sigma_i (2) that on vx_i and vy_i: each belongs to the stage
     whose variables it relaxes. The variables are N groups (u_i, s_i, x_{i+1}, u_i, sigma_{i+1}).
 
+    fatrop has no time limit; `FATROP_ITERATIONS` bounds a solve. With a tolerance below 1e-6 it
+    regularises Hessians near some optima and then gives up (QP_FAILURE from its line search, or
+    MAXITER; one in ten at 1e-8), although IPOPT agrees with its plan.
+
     Parameters
     ----------
     problem
@@ -351,10 +355,6 @@ class FatropSolver(_NlpSolver):
     ------
     ValueError
         If the installed CasADi was built without fatrop.
-
-    fatrop has no time limit; `FATROP_ITERATIONS` bounds a solve. With a tolerance below 1e-6 it
-    regularises Hessians near some optima and then gives up (QP_FAILURE from its line search, or
-    MAXITER; one in ten at 1e-8), although IPOPT agrees with its plan.
     """
 
     GROUP = INPUTS + SOFT + STATES + INPUTS

@@ -34,14 +34,14 @@ FORMS = ("literal", "sinc")
 class FrozenLpvSolver:
     """Solver of one QP per period, with the model A(x, u) x + B(u) u frozen along a plan.
 
+    The frozen system is discretised exactly (zero-order hold by a matrix exponential).
+
     Parameters
     ----------
     problem
         The problem.
     form
         "literal": the matrices as printed. "sinc": the same field with a column of psi.
-
-    The frozen system is discretised exactly (zero-order hold by a matrix exponential).
 
     Raises
     ------
@@ -64,7 +64,7 @@ class FrozenLpvSolver:
         """Solve as `RtiSolver.solve` does, with the frozen model."""
         began = time.perf_counter()
         if not np.isfinite(np.concatenate([state, last_input, reference.ravel(), weights])).all():
-            return Solution(Status.NAN, None, None, None, np.nan, 0, 0.0), None
+            return Solution(Status.NAN), None
         low, high = self.problem.input_bounds
         last = np.clip(last_input, low, high)
         plan = np.tile(last, (self.problem.horizon, 1))
@@ -77,8 +77,8 @@ class FrozenLpvSolver:
     def freeze(self, state: Array, inputs: Array, heading: Array) -> Linearisation:
         """Freeze the model along the roll-out of `inputs` (N, 2) from `state` (6,), discretised.
 
-        `heading` (N + 1,) rad is that of the reference. The returned states are those of the frozen
-        model, not of the field.
+        `heading` (N + 1,) is the reference's, rad. The returned states follow the frozen model, not
+        the field.
         """
         along = self._rti.linearise(state, inputs).states
         n = len(inputs)
@@ -95,7 +95,7 @@ class FrozenLpvSolver:
         return Linearisation(states, a_all, b_all, rate, rate_x, rate_u)
 
     def _continuous(self, x: Array, u: Array, heading: float) -> tuple[Array, Array, Array]:
-        """A (6, 6), B (6, 2) and a constant c (6,) such that A x + B u + c is the field."""
+        """Return A (6, 6), B (6, 2) and c (6,) such that A x + B u + c is the field."""
         a, b = matrices(x, u, self.problem.vehicle)
         constant = np.zeros(6)
         if self.form == "sinc":
@@ -112,7 +112,7 @@ class FrozenLpvSolver:
 
 
 def _held(a: Array, b: Array, constant: Array, period: float) -> tuple[Array, Array, Array]:
-    """Discrete-time A, B and constant of x' = A x + B u + c with u held for a period, s."""
+    """Discretise x' = A x + B u + c with u held for a period (s): A, B and c."""
     block = np.zeros((9, 9))
     block[:6, :6], block[:6, 6:8], block[:6, 8] = a, b, constant
     held: Array = expm(block * period)

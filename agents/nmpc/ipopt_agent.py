@@ -75,7 +75,7 @@ class SolvedNmpc(NmpcAgent[NmpcMemory]):
         self, observation: TrackingObservation, memory: NmpcMemory
     ) -> tuple[float, float]:
         """Treat an observation that is not finite as a failed solve with status NAN."""
-        memory.solution = Solution(Status.NAN, None, None, None, np.nan, 0, 0.0)
+        memory.solution = Solution(Status.NAN)
         return self._fail(observation, memory, Status.NAN)
 
     def _fail(
@@ -89,12 +89,7 @@ class SolvedNmpc(NmpcAgent[NmpcMemory]):
         )
 
     def diagnostics(self, memory: NmpcMemory) -> dict[str, Any]:
-        """Describe the last solve of one vehicle.
-
-        Its status, seconds, iterations, cost, slack (3,), fallback, plan and weights. `weights`
-        (10,) are Q, S, R in use; `plan` (N + 1, 2) holds the predicted positions in the frame of
-        the path's foot point.
-        """
+        """Describe the last solve of one vehicle, see `TrackingAgent.diagnostics`."""
         solution = memory.solution
         if solution is None:
             return {}

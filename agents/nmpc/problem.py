@@ -117,9 +117,9 @@ class Solution(NamedTuple):
     """
 
     status: Status
-    inputs: Array | None
-    states: Array | None
-    slack: Array | None
-    cost: float
-    iterations: int
-    seconds: float
+    inputs: Array | None = None
+    states: Array | None = None
+    slack: Array | None = None
+    cost: float = math.nan
+    iterations: int = 0
+    seconds: float = 0.0

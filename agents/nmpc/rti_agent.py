@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.base import Action, DrivingTask, observation_rows
+from agents.base import Action, DrivingTask, batch_memory, observation_rows
 from agents.nmpc import layout, qp, rti
 from agents.nmpc.base import Fallback, NmpcAgent, NmpcSettings
 from agents.nmpc.problem import INPUTS, STATES, Status
@@ -166,15 +166,12 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             If the observation does not have this agent's layout.
         """
         rows = observation_rows(observation, self._size)
-        n = rows.shape[0]
-        memory = self._memory if state is None else state
-        if memory is None or len(memory) != n:
-            memory = self._new(n)
+        kept = self._memory if state is None else state
+        memory, starts = batch_memory(kept, len(rows), episode_start, self._new)
         if state is None:
             self._memory = memory
-        if episode_start is not None and np.asarray(episode_start).any():
-            for row in np.flatnonzero(np.broadcast_to(episode_start, (n,))).tolist():
-                memory.clear(row)
+        for row in np.flatnonzero(starts).tolist():
+            memory.clear(row)
         if self.has_schedule:
             self.switching.choose(rows, self.problem.horizon, memory.bands, memory.weights)
             weights = memory.weights
@@ -223,12 +220,10 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             rti.bound_action(a, delta, self.solver.constants, memory.actions[row])
 
     def diagnostics(self, memory: RtiRow) -> dict[str, Any]:
-        """Describe the last solve of one vehicle.
+        """Describe the last solve of one vehicle, see `TrackingAgent.diagnostics`.
 
-        Its status, seconds, iterations, cost, slack (3,), fallback, plan and weights. `weights`
-        (10,) are Q, S, R in use; `plan` (N + 1, 2) holds the predicted positions in the frame of
-        the path's foot point; `iterations` counts those of the QP solver; `seconds` is the time of
-        the batch divided by its rows.
+        `iterations` counts those of the QP solver; `seconds` is the batch's time divided by its
+        rows.
         """
         batch, row = memory.memory, memory.row
         stats = batch.stats[row]

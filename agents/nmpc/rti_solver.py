@@ -27,31 +27,6 @@ STATUS = {
 }
 DAMPING = (0.0, 0.0)
 """Default Levenberg term on (a, delta)."""
-
-
-def limits(problem: NmpcProblem, damping: tuple[float, float]) -> Array:
-    """Return the last of a solver's constants (`layout`): bounds, penalties and damping."""
-    car = problem.vehicle
-    first, steps = problem.input_steps[0], problem.input_steps[-1]
-    if problem.horizon == 1:
-        steps = first
-    order = np.array(L.SLACK_OF)
-    return np.array(
-        [
-            *car.acceleration_range,
-            car.max_steering_angle,
-            *steps,
-            *first,
-            *car.speed_range,
-            *car.longitudinal_acceleration_range,
-            car.max_lateral_velocity_ratio,
-            *np.array(problem.linear_penalty)[order],
-            *np.array(problem.quadratic_penalty)[order],
-            *damping,
-        ]
-    )
-
-
 STEP_TOLERANCE = 1e-11
 """Change of the inputs below which the plan has converged."""
 SHORTEST = 1e-6
@@ -210,23 +185,33 @@ class RtiSolver:
             raise ValueError(f"tolerance must be positive, not {tolerance}")
         self.problem = problem
         self.damping = (float(damping[0]), float(damping[1]))
+        car, order = problem.vehicle, np.array(L.SLACK_OF)
         first = problem.period if problem.first_period is None else problem.first_period
-        self.constants = np.concatenate(
+        first_step, last_step = problem.input_steps[0], problem.input_steps[-1]
+        self.constants = np.array(
             [
-                problem.vehicle.as_array(),
-                [
-                    problem.period / problem.substeps,
-                    problem.substeps,
-                    problem.period,
-                    min(first / problem.period, 1.0),
-                    tolerance,
-                ],
-                np.concatenate(problem.input_bounds).astype(np.float32),
-                limits(problem, self.damping),
-            ]
+                *car.as_array(),
+                problem.period / problem.substeps,
+                problem.substeps,
+                problem.period,
+                min(first / problem.period, 1.0),
+                tolerance,
+                *np.concatenate(problem.input_bounds).astype(np.float32),
+                *car.acceleration_range,
+                car.max_steering_angle,
+                *last_step,
+                *first_step,
+                *car.speed_range,
+                *car.longitudinal_acceleration_range,
+                car.max_lateral_velocity_ratio,
+                *np.array(problem.linear_penalty)[order],
+                *np.array(problem.quadratic_penalty)[order],
+                *self.damping,
+            ],
+            dtype=np.float64,
         )
-        n = problem.horizon
-        stages, lanes = L.working_space(n, 1)
+        """As described in `layout`, (CONSTANTS_SIZE,)."""
+        stages, lanes = L.working_space(problem.horizon, 1)
         self._stages, self._lanes = stages[0], lanes[0]
         self._stats = np.zeros(qp.STATS)
         self._iterations = iterations
@@ -248,7 +233,7 @@ class RtiSolver:
         began = time.perf_counter()
         parameters = np.concatenate([state, last_input, reference.ravel(), weights])
         if not np.isfinite(parameters).all():
-            return Solution(Status.NAN, None, None, None, np.nan, 0, 0.0), None
+            return Solution(Status.NAN), None
         n = self.problem.horizon
         low, high = self.problem.input_bounds
         last = np.clip(last_input, low, high)
@@ -279,7 +264,7 @@ class RtiSolver:
             found = L.STEP_VX
         seconds = time.perf_counter() - began
         if status is not Status.SUCCESS:
-            return Solution(status, None, None, None, np.nan, iterations, seconds), None
+            return Solution(status, iterations=iterations, seconds=seconds), None
         solution = Solution(
             status,
             plan,
@@ -333,7 +318,7 @@ class RtiSolver:
         turns = int(self._stats[qp.INNER])
         seconds = time.perf_counter() - began
         if status is not Status.SUCCESS:
-            return Solution(status, None, None, None, np.nan, turns, seconds)
+            return Solution(status, iterations=turns, seconds=seconds)
         cost = rti.cost_of(self._stages, self._lanes, L.NOW_A, weights, self.constants)
         return Solution(
             status, self._inputs(), self._stages[:, L.NOW_VX : L.NOW_Y + 1].copy(),

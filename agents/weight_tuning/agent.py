@@ -8,7 +8,14 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.base import CHECKPOINTS, Action, DrivingTask, check_compatible, observation_rows
+from agents.base import (
+    CHECKPOINTS,
+    Action,
+    DrivingTask,
+    batch_memory,
+    check_compatible,
+    observation_rows,
+)
 from agents.delay import NearFuture, moved_plan
 from agents.nmpc import qp
 from agents.nmpc.rti_agent import RtiNmpc
@@ -128,14 +135,8 @@ class TunedNmpc:
         """
         with np.errstate(over="ignore"):  # becomes infinite, which is handled as such
             rows = observation_rows(observation, self.task.layout.size).astype(np.float32)
-        n = len(rows)
-        memory = self._memory if state is None else state
-        starts = np.zeros(n, dtype=np.bool_)
-        if episode_start is not None:
-            starts |= np.broadcast_to(np.asarray(episode_start, dtype=bool), (n,))
-        if memory is None or len(memory) != n:
-            memory = self._new(n)
-            starts[:] = True
+        kept = self._memory if state is None else state
+        memory, starts = batch_memory(kept, len(rows), episode_start, self._new)
         if state is None:
             self._memory = memory
         for row in np.flatnonzero(starts).tolist():
@@ -180,8 +181,8 @@ class TunedNmpc:
     def diagnostics(self, memory: LoopRow) -> dict[str, Any]:
         """Describe the last step of one vehicle: diagnostics of `lpv-nmpc` and the choice.
 
-        `weights` (10,) are Q, S, R in use; `band` is that of the preview; `rejected` counts the
-        decisions of this episode that were not finite.
+        `band` is the preview's; `rejected` counts the decisions of this episode that were not
+        finite.
         """
         batch, row = memory.memory, memory.row
         found = self.nmpc.diagnostics(batch.nmpc[row])
@@ -196,13 +197,7 @@ class TunedNmpc:
 
 
 def _loaded(weights: str | Path | Mapping[str, Any] | Weights) -> Weights:
-    """Return weights as they are, or those of a mapping or a file.
-
-    Raises
-    ------
-    ValueError
-        For a mapping or a file that cannot be used, or for anything else.
-    """
+    """Return weights as they are, or as a mapping or a file has them; else raise a ValueError."""
     if isinstance(weights, Weights):
         return weights
     if isinstance(weights, Mapping):

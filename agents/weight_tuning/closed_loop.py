@@ -74,8 +74,8 @@ class ClosedLoop:
         The environments, with autoreset mode DISABLED: one that has ended stands still until
         `reset(options={"reset_mask": mask})`. They define paths, vehicles and randomisation.
     agent
-        `lpv-nmpc`, made for such an environment: its problem, settings and delay compensation, and
-        its weights or schedule where `drive` is given none.
+        `lpv-nmpc`, made for one of these environments: its problem, settings and delay
+        compensation, and its weights or schedule where `drive` is given none.
     bands, slew
         Curvature bands of the weights that `drive` is given, with a set each, and the largest
         change of a weight's logarithm, 1/s. By default one set for all bands, and no limit.

@@ -103,9 +103,7 @@ class Decider:
         weights_for_all(
             actions, mask, bands, p.sets, p.matrix, p.log_span, p.catalogue, memory.tables, rejected
         )
-        decided = memory.history[mask]
-        decided[:, [CLOCK, FAILURES, ITERATIONS]] = 0.0
-        memory.history[mask] = decided
+        memory.history[np.ix_(mask, [CLOCK, FAILURES, ITERATIONS])] = 0.0
         return rejected
 
 

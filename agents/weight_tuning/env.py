@@ -213,15 +213,11 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         n = self.num_envs
         self._sums = np.zeros((len(Tally._fields), n))
-        self._solves = 0
+        self.solves = 0
+        """Solves of all environments since they were made: the budget of tuning."""
         self._ended = np.zeros(n, dtype=np.bool_)
         self._rejected = np.zeros(n, dtype=np.int64)
         self._clipped = np.zeros(n, dtype=np.int64)
-
-    @property
-    def solves(self) -> int:
-        """Solves of all environments since they were made: the budget of tuning."""
-        return self._solves
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Infos | None = None
@@ -296,7 +292,7 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         peaks = np.maximum(self._sums[largest], values[largest])
         self._sums += values
         self._sums[largest] = peaks
-        self._solves += int(tally.solves.sum())
+        self.solves += int(tally.solves.sum())
 
     def _rewards(self, tally: Tally, ended: Array) -> Array:
         share = tally.steps / self._decider.window

@@ -55,7 +55,7 @@ class Run(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Working space of one thread; with a leading dimension, that of all threads."""
+    """Working space of one thread, or of all threads with a leading dimension."""
 
     nodes: Array
     """Nodes of the preview, (preview steps + 1, NODE)."""
