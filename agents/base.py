@@ -198,7 +198,8 @@ def batch_memory(
 ) -> tuple[BatchMemory, NDArray[np.bool_]]:
     """Return the memory of a batch, and a mask (rows,) of those in which an episode begins.
 
-    Without a memory, or with one of another number of rows, a new one begins in all of them.
+    A missing memory, or one of another number of rows, is replaced by a new one; an episode then
+    begins in every row.
     """
     starts = np.zeros(rows, dtype=np.bool_)
     if episode_start is not None:

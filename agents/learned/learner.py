@@ -118,7 +118,7 @@ def _outputs(car: VehicleParameters, period: float, origin: str) -> tuple[Array,
 
 
 class _Part:
-    """Environments with the same conditions: observations and features of an agent, its actions."""
+    """One vector environment of a learner: its agent's observations, features and actions."""
 
     def __init__(self, venv: TrackingVecEnv, scaling: Scaling, task: DrivingTask) -> None:
         self.venv, self.scaling = venv, scaling

@@ -192,7 +192,7 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
     ) -> tuple[float, float]:
         """Compute inputs (a, delta) in place of a failed solve.
 
-        The class says what replaces it when.
+        `NmpcAgent` gives the order of the replacements.
 
         Parameters
         ----------

@@ -75,7 +75,7 @@ class FrozenLpvSolver:
         return solution._replace(seconds=time.perf_counter() - began), solution.inputs
 
     def freeze(self, state: Array, inputs: Array, heading: Array) -> Linearisation:
-        """Freeze the model along the roll-out of `inputs` (N, 2) from `state` (6,), discretised.
+        """Freeze the model along the roll-out of `inputs` (N, 2) from `state` (6,); discretise it.
 
         `heading` (N + 1,) is the reference's, rad. The returned states follow the frozen model, not
         the field.

@@ -197,7 +197,10 @@ class TunedNmpc:
 
 
 def _loaded(weights: str | Path | Mapping[str, Any] | Weights) -> Weights:
-    """Return weights as they are, or as a mapping or a file has them; else raise a ValueError."""
+    """Load weights from a mapping or a file, and return others as they are.
+
+    Anything else, or a file that cannot be used, is a ValueError.
+    """
     if isinstance(weights, Weights):
         return weights
     if isinstance(weights, Mapping):
