@@ -14,7 +14,7 @@ from lpv_track_env import episodes, kernels, plants
 from lpv_track_env.conditions import Actuation, Conditions
 from lpv_track_env.conditions import episode as conditions_episode
 from lpv_track_env.conditions import load as load_conditions
-from lpv_track_env.conditions.layout import ConditionedVehicle
+from lpv_track_env.conditions.layout import ConditionedVehicle, info_of
 from lpv_track_env.draws import random_key
 from lpv_track_env.episodes import single_info
 from lpv_track_env.observation import ObservationLayout
@@ -350,7 +350,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self.render()
         info = single_info(self._record)
         if self._conditioned is not None:
-            info.update(self._conditioned.info())
+            info.update(info_of(self._conditioned.vehicle))
         return self._observation.copy(), info
 
     def _count_episode(self, *, reseeded: bool) -> None:
@@ -401,7 +401,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         ) = self._advance(*self._arguments)  # fmt: skip
         info["state"] = self._state.copy()
         if self._conditioned is not None:
-            info.update(self._conditioned.info())
+            info.update(info_of(self._conditioned.vehicle))
         terminated = truncated = False
         if end:
             if end == kernels.NOT_FINITE:
@@ -411,14 +411,11 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             terminated = not truncated
             self._running = False
         if self.render_mode is not None:
-            self._show()
+            if self._renderer is not None:
+                self._renderer.follow(self._record)
+            if self.render_mode == "human":
+                self.render()
         return self._observation.copy(), reward, terminated, truncated, info
-
-    def _show(self) -> None:
-        if self._renderer is not None:
-            self._renderer.follow(self._record)
-        if self.render_mode == "human":
-            self.render()
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene: a frame (600, 900, 3) uint8 for "rgb_array", a window for "human"."""

@@ -56,7 +56,7 @@ NOT_FINITE = -1
 """Code in place of an end: the command is not finite."""
 
 RANGE_ACCELERATION, RATE_ACCELERATION, RANGE_STEERING, RATE_STEERING = 1, 2, 4, 8
-"""Bits that tell which limits of the actuators clipped the command."""
+"""Bits of `CLIPPED`, one for each limit of the actuators that clipped the command."""
 
 MAX_HEADING_ERROR = 0.5 * math.pi
 BOUNDS = tuple(bound for _, _, bound in SCALARS)

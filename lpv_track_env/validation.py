@@ -1,4 +1,4 @@
-"""Checks of what environments are given: arguments, actions, reset options, seeds, threads.
+"""Checks of the arguments, actions, reset options, seeds and threads of environments.
 
 A check returns the value in the form that its caller works with, or raises an error of one line.
 """

@@ -32,7 +32,6 @@ MODES = {
     AutoresetMode.DISABLED: vector_kernels.DISABLED,
 }
 
-
 EPISODE = 1
 """Column of an episode's number in `EnvArrays.draws`."""
 NOT_BEGUN = np.uint64(2**64 - 1)
@@ -119,35 +118,38 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         paths = validation.listed("trajectory", settings["trajectory"])
         cars = validation.listed("vehicle", settings["vehicle"])
         self.num_envs = operator.index(num_envs)
-        self._single = PathTrackingEnv(**settings | {"trajectory": paths[0], "vehicle": cars[0]})
+        self.single = PathTrackingEnv(**settings | {"trajectory": paths[0], "vehicle": cars[0]})
+        """A single environment with the same settings, first path and first vehicle, for agents."""
         self.autoreset_mode = validation.checked_mode(autoreset_mode)
         self._mode = MODES[self.autoreset_mode]
-        self.metadata = {**self._single.metadata, **self.metadata}
+        self.metadata = {**self.single.metadata, **self.metadata}
         self.metadata["autoreset_mode"] = self.autoreset_mode
         self._threads = validation.checked_threads(threads)
         self._paths, self._cars = paths, cars
         self._drawn = (0, len(paths), len(cars))
         self.tasks = self._tasks_of(paths, cars)
-        self.single_observation_space = self._single.observation_space
+        self.single_observation_space = self.single.observation_space
         self.single_action_space = action_space([task.vehicle for task in self.tasks])
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        n, size = self.num_envs, self._single.layout.size
+        n, size = self.num_envs, self.single.layout.size
         draws = np.zeros((n, 2), dtype=np.uint64)
         draws[:, EPISODE] = NOT_BEGUN
-        nothing, given = np.zeros((0, 0)), self._single.conditions
-        self._arrays = EnvArrays(
+        nothing, given = np.zeros((0, 0)), self.single.conditions
+        self.arrays = EnvArrays(
             records=np.zeros((n, kernels.RECORD_SIZE)),
             observations=np.zeros((n, size), dtype=np.float32),
             ends=np.zeros(n, dtype=np.int64),
             cases=np.zeros(n, dtype=np.int64),
             constants=nothing, tables=nothing, rows=nothing, draws=draws,
         )  # fmt: skip
-        self._conditions: ConditionArrays | None = None
+        """Arrays of the current episodes, for compiled code that steps them in place."""
+        self.condition_arrays: ConditionArrays | None = None
+        """Further arrays under conditions; None for "simulation"."""
         final_vehicles, scratch = nothing, vector_kernels.SCRATCH_SIZE
         if given is not None:
-            vehicle_size = layout.vehicle_size(given, self._single.control_period)
-            self._conditions = ConditionArrays(np.zeros((n, vehicle_size)), nothing)
+            vehicle_size = layout.vehicle_size(given, self.single.control_period)
+            self.condition_arrays = ConditionArrays(np.zeros((n, vehicle_size)), nothing)
             final_vehicles, scratch = np.zeros((n, vehicle_size)), filtering.WORK
         self._pack(self.tasks)
         self._step = StepArrays(
@@ -165,7 +167,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
     def _tasks_of(self, paths: Sequence[Any], cars: Sequence[Any]) -> list[Task]:
         """Return the task of every combination, vehicles side by side."""
         return [
-            self._single.episode_task({"trajectory": path, "vehicle": car})
+            self.single.episode_task({"trajectory": path, "vehicle": car})
             for path in paths
             for car in cars
         ]
@@ -181,69 +183,54 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
                 first += len(tables[-1])
                 tables.append(task.path.table)
             rows.append((first, first + len(tables[-1])))
-        self._arrays = self._arrays._replace(
+        self.arrays = self.arrays._replace(
             constants=np.stack([task.constants() for task in tasks]),
             tables=np.concatenate(tables),
             rows=np.array(rows),
         )
-        if self._conditions is not None:
+        if self.condition_arrays is not None:
             given = tasks[0].conditions
             assert given is not None
             specs = [layout.spec_of(given, task.vehicle, task.control_period) for task in tasks]
-            self._conditions = self._conditions._replace(specs=np.stack(specs))
+            self.condition_arrays = self.condition_arrays._replace(specs=np.stack(specs))
 
     def task_of(self, index: int) -> Task:
         """Return the task of the current episode of environment `index`: its path, its vehicle."""
-        return self._packed[int(self._arrays.cases[index])]
+        return self._packed[int(self.arrays.cases[index])]
 
     @property
     def begun(self) -> bool:
         """True once every environment has had a reset."""
-        return not (self._arrays.draws[:, EPISODE] == NOT_BEGUN).any()
+        return not (self.arrays.draws[:, EPISODE] == NOT_BEGUN).any()
 
     def copy(self, source: Array, target: Array) -> None:
         """Copy environments `source` (m,) onto `target` (m,): state, seeds, disturbances.
 
         Equal actions have equal effects from then on, until the next reset with another seed.
         """
-        a = self._arrays
+        a = self.arrays
         for array in (a.records, a.observations, a.ends, a.cases, a.draws):
             array[target] = array[source]
-        if self._conditions is not None:
-            self._conditions.vehicles[target] = self._conditions.vehicles[source]
-
-    @property
-    def single(self) -> PathTrackingEnv:
-        """A single environment with the same settings, first path and first vehicle, for agents."""
-        return self._single
-
-    @property
-    def arrays(self) -> EnvArrays:
-        """Arrays of the current episodes, not copies, for compiled code that steps them."""
-        return self._arrays
-
-    @property
-    def condition_arrays(self) -> ConditionArrays | None:
-        """Further arrays under conditions, not copies; None for "simulation"."""
-        return self._conditions
+        if self.condition_arrays is not None:
+            self.condition_arrays.vehicles[target] = self.condition_arrays.vehicles[source]
 
     @property
     def records(self) -> Array:
         """Records of the current episodes, (n, `kernels.RECORD_SIZE`), not to be written."""
-        return self._arrays.records
+        return self.arrays.records
 
     def info_of(self, index: int) -> Infos:
         """Return the info of environment `index`, as in a single environment, without its end."""
         info = single_info(self.records[index])
-        if self._conditions is not None:
-            info.update(layout.info_of(self._conditions.vehicles[index]))
+        if self.condition_arrays is not None:
+            info.update(layout.info_of(self.condition_arrays.vehicles[index]))
         return info
 
     def final_of(self, index: int) -> tuple[Infos, Array]:
         """Return the last info and observation of environment `index`, just ended in SAME_STEP."""
         record = self._step.final_records[index]
         info = {**single_info(record), "end": kernels.END_NAMES[int(record[kernels.END])]}
-        if self._conditions is not None:
+        if self.condition_arrays is not None:
             info.update(layout.info_of(self._step.final_vehicles[index]))
         return info, self._step.final_observations[index].copy()
 
@@ -282,24 +269,24 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             super().reset(seed=seed)
         self._take_keys(seeds, mask)
         self._pack_beside(tasks if tasks is not self.tasks else [], mask)
-        vector_kernels.begin_all(mask, self._arrays, self._conditions, drawn, given)
-        return self._arrays.observations.copy(), self._infos(mask)
+        vector_kernels.begin_all(mask, self.arrays, self.condition_arrays, drawn, given)
+        return self.arrays.observations.copy(), self._infos(mask)
 
     def _pack_beside(self, extra: list[Task], mask: Array) -> None:
         """Pack the constructor's tasks, `extra` ones, and those that unmarked episodes use."""
         fixed = len(self.tasks)
-        used = sorted({case for case in self._arrays.cases[~mask].tolist() if case >= fixed})
+        used = sorted({case for case in self.arrays.cases[~mask].tolist() if case >= fixed})
         if not extra and len(self._packed) == fixed + len(used):
             return
         kept = [self._packed[case] for case in used]
         moved = {case: fixed + len(extra) + k for k, case in enumerate(used)}
-        cases = self._arrays.cases
+        cases = self.arrays.cases
         cases[:] = [moved.get(case, min(case, fixed - 1)) for case in cases.tolist()]
         self._pack([*self.tasks, *extra, *kept])
 
     def _take_keys(self, seeds: Sequence[int | None], mask: Array) -> None:
         """Draw a new key for every marked environment that is seeded or has none yet."""
-        draws = self._arrays.draws
+        draws = self.arrays.draws
         for i in np.flatnonzero(mask).tolist():
             seed = seeds[i]
             if seed is None and draws[i, EPISODE] != NOT_BEGUN:
@@ -315,22 +302,22 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
             last = self._step
             infos.update(final_infos(last.final_records, last.final_observations, ended))
-            if self._conditions is not None:
+            if self.condition_arrays is not None:
                 infos["final_info"].update(layout.infos_of(last.final_vehicles, ended))
         return observations, rewards, terminated, truncated, infos
 
     def _infos(self, mask: Array | None = None) -> Infos:
         """Return infos of the environments that `mask` (n,) marks, or of all."""
         infos = episode_infos(self.records, mask)
-        if self._conditions is not None:
+        if self.condition_arrays is not None:
             shown = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask
-            infos.update(layout.infos_of(self._conditions.vehicles, shown))
+            infos.update(layout.infos_of(self.condition_arrays.vehicles, shown))
         return infos
 
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array]:
         """Step as `step` does, without making infos."""
         self._check_order()
-        envs, step = self._arrays, self._step
+        envs, step = self.arrays, self._step
         step.commands[:] = validation.checked_actions(
             actions, envs.ends, self._mode == vector_kernels.NEXT_STEP
         )
@@ -338,7 +325,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         span = (0, self.num_envs) if alone else (len(self._scratch), self.num_envs)
         scratch = self._scratch[0] if alone else self._scratch
         arguments = (
-            *span, self._mode, envs, self._conditions, step, self._drawn, self._nothing_given,
+            *span, self._mode, envs, self.condition_arrays, step, self._drawn, self._nothing_given,
             scratch,
         )  # fmt: skip
         if self._advance is None:
@@ -361,8 +348,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
 
     def _check_order(self) -> None:
         self._check_begun()
-        if self.autoreset_mode is AutoresetMode.DISABLED and self._arrays.ends.any():
-            index = int(np.argmax(self._arrays.ends != kernels.RUNNING))
+        if self.autoreset_mode is AutoresetMode.DISABLED and self.arrays.ends.any():
+            index = int(np.argmax(self.arrays.ends != kernels.RUNNING))
             raise gymnasium.error.ResetNeeded(
                 f"the episode of environment {index} has ended: call "
                 "reset(options={'reset_mask': mask}) before step()"
@@ -388,13 +375,13 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             return None
         self._check_begun()
         return tuple(
-            self._single.draw(self.task_of(i), self.records[i], None if notes is None else notes[i])
+            self.single.draw(self.task_of(i), self.records[i], None if notes is None else notes[i])
             for i in range(self.num_envs)
         )
 
     def close_extras(self, **_: Any) -> None:
         """Close the renderer."""
-        self._single.close()
+        self.single.close()
 
     def __getstate__(self) -> dict[str, Any]:
         # The compiled entry cannot be copied; the next step finds it again.

@@ -198,8 +198,8 @@ class _Accelerator(event.Listener):
     would walk an ever larger heap and free little.
 
     The types that numba infers for operations on plain numbers are remembered, which saves an
-    eighth: for every product of two floats numba would try anew all that a product can mean (of
-    strings, lists, arrays, ...).
+    eighth: without this, numba tries every meaning of a product (of strings, lists, arrays, ...)
+    for each product of two floats.
     """
 
     def __init__(self) -> None:

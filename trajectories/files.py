@@ -56,7 +56,10 @@ def write(path: ReferencePath, file: str | Path) -> None:
         path.acceleration, path.time,
     )  # fmt: skip
     lines.extend(",".join(map(repr, row)) for row in np.column_stack(columns).tolist())
-    _replace(Path(file), "\n".join(lines) + "\n")
+    try:
+        write_atomically(Path(file), ("\n".join(lines) + "\n").encode())
+    except OSError as error:
+        raise OSError(error.errno, f"cannot write the path: {error.strerror}", str(file)) from error
 
 
 def _comment(key: str, value: object) -> str:
@@ -74,13 +77,6 @@ def _plain(value: object) -> object:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} is not a JSON value")
-
-
-def _replace(file: Path, text: str) -> None:
-    try:
-        write_atomically(file, text.encode())
-    except OSError as error:
-        raise OSError(error.errno, f"cannot write the path: {error.strerror}", str(file)) from error
 
 
 def read(file: str | Path) -> ReferencePath:

@@ -2,7 +2,7 @@
 
 One copy of this arithmetic serves `ReferencePath` and the environments' kernels. A table has shape
 (n, 8), C-contiguous (a node is one cache line), with nodes on a uniform grid of arc length; a cell
-is what lies between two nodes, and u in [0, 1] the place in it. Between nodes, positions and
+is the interval between two nodes, and u in [0, 1] the place in it. Between nodes, positions and
 headings are cubic Hermite interpolants (the tangent and the curvature at the nodes are their
 derivatives), and the acceleration is constant.
 """

@@ -23,7 +23,7 @@ Array = NDArray[Any]
 def take_command(m: Array, record: Array, a: Any, delta: Any, spec: Array, constants: Array) -> int:
     """Begin a control period: queue its command unless the controller is busy.
 
-    Returns the bits of what the actuators clipped.
+    Returns the clipping bits.
     """
     p, commands = constants, m[layout.TAIL : layout.fixes_start(spec)]
     ekf = m[layout.filter_start(spec) :]
@@ -183,7 +183,7 @@ def command_under_conditions(data: Array, m: Array, spec: Array) -> tuple[Any, A
     """Begin a control period of a plant other than the bicycle.
 
     Returns the mean acceleration of the drive over the period (m/s^2), the angle of the wheels at
-    its end (rad), and the bits of what the actuators clipped.
+    its end (rad), and the clipping bits.
     """
     record, constants = data[k.RECORD : k.CONSTANTS], data[k.CONSTANTS : k.OBSERVATION]
     bits = take_command(m, record, data[0], data[1], spec, constants)

@@ -167,13 +167,9 @@ class ConditionedVehicle(NamedTuple):
             raise ValueError(f"computing times must be 0 to {LONGEST_DELAY:g} s")
         self.vehicle[LATENCY], self.vehicle[OCCUPIED] = latency, occupied
 
-    def info(self) -> dict[str, Any]:
-        """Return the entries that conditions add to infos."""
-        return info_of(self.vehicle)
-
 
 def info_of(m: Array) -> dict[str, Any]:
-    """Return the entries that conditions add to the info of a vehicle: of its filter and commands.
+    """Return the entries that conditions add to the info of a vehicle.
 
     `estimate` (6,), `position_deviation` (m), `stopping` and `deadline_misses`.
     """

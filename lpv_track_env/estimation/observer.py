@@ -1,4 +1,4 @@
-"""Observations of a path from estimated states, for the computer of a vehicle and for logs."""
+"""Observations of a path from states of other sources: estimates, logs, other simulations."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,16 +9,20 @@ from lpv_track_env.observation import ObservationLayout
 from trajectories import ReferencePath
 from trajectories.projection import SEARCH_WINDOW, tightest_turn
 
+Array = NDArray[np.float64]
+
 
 class PathObserver:
-    """Compute the observations that the environments would return for estimated states.
+    """Compute the observations that the environments would return for given states.
 
     Parameters
     ----------
     path
-        The reference; the preview shows its speed.
+        Reference path.
     layout
         Layout of the observation, the same as the agent's.
+    table
+        Table whose speeds the preview shows, (n, 8); by default the path's own.
 
     Examples
     --------
@@ -27,8 +31,11 @@ class PathObserver:
     >>> action, _ = agent.predict(observer.observe(state, acceleration, steering_angle))
     """
 
-    def __init__(self, path: ReferencePath, layout: ObservationLayout) -> None:
+    def __init__(
+        self, path: ReferencePath, layout: ObservationLayout, table: Array | None = None
+    ) -> None:
         self.path, self.layout = path, layout
+        self._table = path.table if table is None else table
         self._record = np.zeros(kernels.RECORD_SIZE)
         self._observation = np.zeros(layout.size, dtype=np.float32)
         self._constants = np.zeros(kernels.CONSTANTS_SIZE)
@@ -44,20 +51,26 @@ class PathObserver:
         self._record[kernels.ARC_LENGTH] = foot.arc_length
 
     def observe(
-        self, state: ArrayLike, acceleration: float, steering_angle: float
+        self, state: ArrayLike, acceleration: float, steering_angle: float, ahead: float = 0.0
     ) -> NDArray[np.float32]:
-        """Return the observation (size,) of an estimated state (6,) and the actuators.
+        """Return the observation (size,) of a state (6,) and the actuators (m/s^2, rad).
 
-        The foot point is searched near the last one, hence on the same branch of the path.
+        The foot point is searched about `ahead` m after the last one, hence on the same branch of
+        the path.
         """
         self._record[:6] = state
         self._record[kernels.ACCELERATION] = acceleration
         self._record[kernels.STEERING] = steering_angle
-        window = min(SEARCH_WINDOW, self.path.length)
+        window = min(max(SEARCH_WINDOW, 1.5 * abs(ahead)), self.path.length)
         kernels.locate_and_observe(
-            self._record, self._constants, self.path.table, self._observation, 0.0, window
+            self._record, self._constants, self._table, self._observation, ahead, window
         )
         return self._observation.copy()
+
+    @property
+    def state(self) -> Array:
+        """Last state [vx, vy, psi, r, X, Y], (6,), a copy."""
+        return self._record[:6].copy()
 
     @property
     def arc_length(self) -> float:
@@ -73,3 +86,8 @@ class PathObserver:
     def heading_error(self) -> float:
         """Heading error of the last state, rad."""
         return float(self._record[kernels.HEADING_ERROR])
+
+    @property
+    def speed_error(self) -> float:
+        """Speed of the last state minus that of the reference, m/s."""
+        return float(self._record[kernels.SPEED_ERROR])

@@ -92,7 +92,7 @@ class HighwayTrackEnv(PathTrackingEnv):
     other_vehicles
         Number of other vehicles, as the scene counts it (`Scene.make`); None for its default.
     cruise
-        Settings of the gap; None keeps the path's own speed whoever is ahead.
+        Settings of the gap; None keeps the path's own speed regardless of traffic.
     speed_limits
         Limits of the reference; by default 2 m/s^2 laterally, 1.5 m/s^2 longitudinally and the
         scene's speed.

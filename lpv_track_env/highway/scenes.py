@@ -162,7 +162,7 @@ def populate(highway: AbstractEnv, seed: int) -> Vehicle:
 
 
 def move(road: Road, period: float) -> None:
-    """Let every vehicle decide and drive for a control period (s), in steps as highway-env's."""
+    """Let every vehicle decide and drive for a control period (s), in equal steps."""
     steps = math.ceil(period / SIMULATION_PERIOD - 1e-9)
     for _ in range(steps):
         road.act()

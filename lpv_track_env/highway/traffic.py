@@ -1,4 +1,4 @@
-"""The vehicle among others: what the traffic sees of it, who is ahead, and a reference that yields.
+"""The ego vehicle in traffic: its body, the vehicles ahead, and a reference that keeps the gap.
 
 Gaps and speeds of the vehicles ahead are measured along the path, as adaptive cruise control needs
 them.
@@ -54,14 +54,9 @@ class EgoVehicle(Vehicle):
         super().__init__(road, (0.0, 0.0))
 
     def place(self, state: Array, reference_speed: float) -> None:
-        """Move the vehicle to the plant's state.
+        """Move the vehicle to the plant's state [vx, vy, psi, r, X, Y], (6,).
 
-        Parameters
-        ----------
-        state
-            [vx, vy, psi, r, X, Y], shape (6,).
-        reference_speed
-            m/s, the speed that the traffic takes for this vehicle's target speed.
+        The traffic takes `reference_speed` (m/s) for this vehicle's target speed.
         """
         heading = float(state[PSI])
         c, s = math.cos(heading), math.sin(heading)
@@ -106,17 +101,7 @@ class Located(NamedTuple):
 
 
 class Stretch:
-    """The part of a path ahead of a vehicle.
-
-    Parameters
-    ----------
-    path
-        Reference path of the vehicle.
-    arc_length
-        Arc length of the vehicle's foot point, m.
-    reach
-        Length of the stretch, m.
-    """
+    """The next `reach` m of a path from a vehicle's foot point at `arc_length` (m)."""
 
     def __init__(self, path: ReferencePath, arc_length: float, reach: float) -> None:
         last = len(path.x) - 1
@@ -157,28 +142,16 @@ def leaders(
     others: Sequence[RoadObject],
     cruise: CruiseControl,
 ) -> list[Leader]:
-    """Find the bodies ahead that block the path, or will block it.
+    """Find the bodies ahead that block the path of a vehicle, or will block it.
+
+    The vehicle's foot point is at `arc_length` (m), its front bumper `front` (m) ahead of that, and
+    `half_width` (m) is half the width of its body.
 
     A body will block the path if it moves into it sideways at its present lateral speed within the
     time of a cut-in, or if its own lane leads into it, as at a merge or a roundabout. In the second
     case its place is projected back: the arc length that it will reach on the path, minus the
     distance that it covers until then. So of two vehicles that approach a merge, the one that would
     arrive later yields.
-
-    Parameters
-    ----------
-    path
-        Reference path of the vehicle.
-    arc_length
-        Arc length of its foot point, m.
-    front
-        Distance from its foot point to its front bumper, m.
-    half_width
-        Half width of its body, m.
-    others
-        Other bodies on the road.
-    cruise
-        Range, side clearance and time of a cut-in.
     """
     stretch = Stretch(path, arc_length, cruise.range)
     bumper = arc_length + front
@@ -253,7 +226,7 @@ class TrafficReference:
     layout
         Layout of the observation: the speeds are lowered at least as far as its preview reaches.
     cruise
-        Settings of the gap; None keeps the path's own speed whoever is ahead.
+        Settings of the gap; None keeps the path's own speed regardless of traffic.
 
     Attributes
     ----------
@@ -280,15 +253,7 @@ class TrafficReference:
         self._lowered = False
 
     def update(self, arc_length: float, speed: float, others: Sequence[RoadObject]) -> None:
-        """Find the vehicle ahead, and lower the speeds to keep the gap.
-
-        Parameters
-        ----------
-        arc_length, speed
-            Arc length and speed of this vehicle, m and m/s.
-        others
-            Other bodies on the road.
-        """
+        """Find the vehicle ahead of an arc length (m), and lower the speeds (m/s) to keep the gap."""
         ahead = leaders(
             self.path, arc_length, self._front, self._half_width, others, self._settings
         )

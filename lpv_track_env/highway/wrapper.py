@@ -12,18 +12,15 @@ from highway_env.envs.common.action import ContinuousAction
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
-from lpv_track_env import kernels
-from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.conditions import Actuation
+from lpv_track_env.estimation.observer import PathObserver
 from lpv_track_env.highway.cruise import CruiseControl
 from lpv_track_env.highway.routes import lane_route, reference_path, road_ahead
 from lpv_track_env.highway.traffic import TrafficReference, others_on
 from lpv_track_env.observation import ObservationLayout
-from lpv_track_env.reward import RewardWeights
-from lpv_track_env.task import Task
+from lpv_track_env.task import action_space
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
-from trajectories.projection import SEARCH_WINDOW
 from trajectories.speed import SpeedLimits
 
 LIMITS = SpeedLimits(max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5)
@@ -35,8 +32,7 @@ def vehicle_of(env: AbstractEnv) -> VehicleParameters:
     Its kinematic bicycle has the yaw rate v sin(beta) / (L / 2), tan(beta) = tan(delta) / 2, with L
     the length of its body: a wheelbase of L, the centre of gravity in the middle. It has no slip
     and so no tyres; the stiffness here gives a neutral vehicle the same turns, with 2 degrees of
-    slip at 5 m/s^2. highway-env limits no rates; the steering rate here is one that a driver can
-    reach.
+    slip at 5 m/s^2. highway-env limits no rates; the steering rate here is within a driver's reach.
 
     Raises
     ------
@@ -143,11 +139,7 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._limits = speed_limits
         bound = self.layout.bound
         self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
-        low, high = self.vehicle.acceleration_range
-        steering = self.vehicle.max_steering_angle
-        self.action_space = spaces.Box(
-            np.array([low, -steering], np.float32), np.array([high, steering], np.float32)
-        )
+        self.action_space = action_space([self.vehicle])
         self._begin()
 
     @property
@@ -169,42 +161,36 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         if not self._throttle:
             path = path.with_speed(max(float(start.speed), 1.0))
         self._reference = TrafficReference(path, self.vehicle, self.layout, self._cruise)
-        task = Task(path, self.vehicle, self.control_period, self.layout, RewardWeights(),
-                    max_lateral_error=1e6, time_limit=None)  # fmt: skip
-        self._constants = task.constants()
-        self._record = np.zeros(kernels.RECORD_SIZE)
-        self._record[kernels.ARC_LENGTH] = path.project(*start.position).arc_length
-        self._observation = np.zeros(self.layout.size, dtype=np.float32)
+        self._observer = PathObserver(path, self.layout, self._reference.table)
+        self._observer.begin(self._state())
+
+    def _state(self) -> NDArray[np.float64]:
+        """Return the vehicle's state [vx, vy, psi, r, X, Y], (6,)."""
+        car = self.highway.vehicle
+        slip = math.atan(0.5 * math.tan(float(car.action["steering"])))
+        vx, vy = car.speed * math.cos(slip), car.speed * math.sin(slip)
+        yaw_rate = car.speed * math.sin(slip) / (0.5 * car.LENGTH)
+        return np.array([vx, vy, car.heading, yaw_rate, *car.position], dtype=np.float64)
 
     def _observe(self, ahead: float) -> NDArray[np.float32]:
         """Observe the vehicle, whose foot point is about `ahead` m after the last one."""
-        car, record = self.highway.vehicle, self._record
-        steering = float(car.action["steering"])
-        slip = math.atan(0.5 * math.tan(steering))
-        record[VX], record[VY] = car.speed * math.cos(slip), car.speed * math.sin(slip)
-        record[PSI], record[YAW_RATE] = car.heading, car.speed * math.sin(slip) / (0.5 * car.LENGTH)
-        record[X], record[Y] = car.position
-        record[kernels.ACCELERATION] = float(car.action["acceleration"])
-        record[kernels.STEERING] = steering
-        window = min(max(SEARCH_WINDOW, 1.5 * abs(ahead)), self.path.length)
-        kernels.locate_and_observe(
-            record, self._constants, self._reference.table, self._observation, ahead, window
+        action = self.highway.vehicle.action
+        return self._observer.observe(
+            self._state(), float(action["acceleration"]), float(action["steering"]), ahead
         )
-        return self._observation.copy()
 
     def _follow_traffic(self) -> None:
         road, car = self.highway.road, self.highway.vehicle
-        s = float(self._record[kernels.ARC_LENGTH])
-        self._reference.update(s, float(car.speed), others_on(road, car))
+        self._reference.update(self._observer.arc_length, float(car.speed), others_on(road, car))
 
     def _info(self) -> dict[str, Any]:
-        m = self._record
+        observer = self._observer
         return {
-            "lateral_error": float(m[kernels.LATERAL_ERROR]),
-            "heading_error": float(m[kernels.HEADING_ERROR]),
-            "speed_error": float(m[kernels.SPEED_ERROR]),
-            "arc_length": float(m[kernels.ARC_LENGTH]),
-            "state": m[:6].copy(),
+            "lateral_error": observer.lateral_error,
+            "heading_error": observer.heading_error,
+            "speed_error": observer.speed_error,
+            "arc_length": observer.arc_length,
+            "state": observer.state,
             "gap": float(self._reference.leader.gap),
         }
 

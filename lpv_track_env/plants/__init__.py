@@ -115,11 +115,8 @@ def make(plant: str | Factory, vehicle: VehicleParameters) -> Plant | None:
 class PlantEpisode:
     """Control periods of an environment whose plant is not the kernels' bicycle.
 
-    Parameters
-    ----------
-    plant
-        The plant. The kernels still compute the actuators before it, and errors, reward and end of
-        the episode after it.
+    The kernels still compute the actuators before the plant, and errors, reward and end of the
+    episode after it.
     """
 
     def __init__(self, plant: Plant) -> None:

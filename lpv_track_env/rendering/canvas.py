@@ -57,7 +57,7 @@ def shades(scale: str, shares: Sequence[float] | Array) -> list[Colour]:
 
 
 class Letters:
-    """Renderer of text that keeps what it has rendered.
+    """Text renderer with a cache.
 
     Sizes are in pixels of the frame; the surfaces are larger by SUPERSAMPLING.
     """
@@ -122,16 +122,10 @@ def card(width: float, height: float) -> pygame.Surface:
 
 
 class View:
-    """Map from the world (m, y upwards) to pixels (y downwards).
+    """Map from the world (m, y upwards) to pixels (y downwards), `scale` pixels per metre.
 
-    Parameters
-    ----------
-    centre
-        Place in the world (m, m) shown at `middle`.
-    scale
-        Pixels per metre.
-    middle
-        Pixel (x, y) at the middle of the picture, or right of it and below.
+    The place `centre` (m, m) is shown at the pixel `middle`: the middle of the picture, or right of
+    it and below.
     """
 
     def __init__(

@@ -146,15 +146,7 @@ def signals_of(task: Task) -> list[Signal]:
 
 
 class Charts:
-    """The strip below the scene: one chart for each signal, side by side.
-
-    Parameters
-    ----------
-    signals
-        Signals to show.
-    letters
-        Renderer of text.
-    """
+    """The strip below the scene: one chart for each signal, side by side."""
 
     def __init__(self, signals: Sequence[Signal], letters: Letters) -> None:
         self._signals, self._letters = signals, letters

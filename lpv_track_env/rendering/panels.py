@@ -26,15 +26,7 @@ BANDS = CurvatureBands()
 
 
 class Cards:
-    """The cards of an episode's frames.
-
-    Parameters
-    ----------
-    task
-        Path, vehicle and limits of the episode.
-    letters
-        Renderer of text.
-    """
+    """The cards of an episode's frames; the task's card shows its path and vehicle."""
 
     def __init__(self, task: Task, letters: Letters) -> None:
         self._task, self._letters = task, letters

@@ -1,9 +1,7 @@
 """Compose frames of an episode, as arrays or in a window, with a camera that follows the vehicle.
 
-"rgb_array" draws on a surface in memory and needs no display. "human" opens a window and keeps real
-time; closing it (or Escape) ends the drawing but not the run, and Space pauses. On a machine
-without a display SDL draws invisibly: the renderer warns once and does not wait for real time.
-Only where SDL has no video driver at all, a RuntimeError is raised.
+"rgb_array" draws on a surface in memory and needs no display. "human" opens a `window.Window` and
+keeps real time; closing it ends the drawing but not the run.
 
 A frame depends only on the task, the records since `begin`, and the agent's plan and notes: equal
 episodes give equal frames. Camera, trail and charts use the episode's own time, so a frame does not
@@ -23,12 +21,11 @@ from lpv_track_env.rendering import canvas
 from lpv_track_env.rendering.canvas import SUPERSAMPLING, Letters, View
 from lpv_track_env.rendering.charts import Charts, History, signals_of
 from lpv_track_env.rendering.panels import Cards, make_legend
-from lpv_track_env.rendering.track import COLOURINGS, MAP_SIZE, Scenery, SceneryDrawing, Track
+from lpv_track_env.rendering.track import MAP_SIZE, Scenery, SceneryDrawing, Track
 from lpv_track_env.rendering.vehicles import VehicleDrawing, axle_forces, draw_others
 from lpv_track_env.rendering.window import Window
 from lpv_track_env.task import Task
 from trajectories import ReferencePath
-from trajectories.naming import choose
 
 Array = NDArray[np.float64]
 
@@ -53,10 +50,7 @@ TURNING, ZOOMING = 0.45, 0.8
 
 
 class Camera:
-    """View that follows the vehicle and looks ahead, wider at higher speed.
-
-    Its motion is smoothed over the episode's own time, so equal episodes look equal.
-    """
+    """View that follows the vehicle and looks ahead, smoothed and wider at higher speed."""
 
     def __init__(self) -> None:
         self._stages: Array | None = None
@@ -121,15 +115,10 @@ class Renderer:
     others
         Other vehicles, (m, 5) [X m, Y m, heading rad, length m, width m], or None.
 
-    Raises
-    ------
-    ValueError
-        For an unknown colour.
     """
 
     def __init__(self, render_mode: str, fps: int, colour: str = "speed") -> None:
-        self.render_mode = render_mode
-        self.colour = choose("colour", colour, tuple(COLOURINGS))
+        self.render_mode, self.colour = render_mode, colour
         self.plan: NDArray[np.float64] | None = None
         self.notes: Mapping[str, str] = {}
         self.others: NDArray[np.float64] | None = None
@@ -148,12 +137,7 @@ class Renderer:
     def begin(self, task: Task, scenery: Scenery | None = None) -> None:
         """Begin an episode: prepare its fixed parts and forget the last one.
 
-        Parameters
-        ----------
-        task
-            Path, vehicle and limits of the episode.
-        scenery
-            Roads to draw in place of the corridor.
+        A `scenery` is drawn in place of the corridor.
 
         Raises
         ------
@@ -179,12 +163,9 @@ class Renderer:
             self._camera.follow(time, vx, x, y, float(record[kernels.ARC_LENGTH]), self._task.path)
 
     def draw(self, record: Array) -> NDArray[np.uint8] | None:
-        """Draw a frame for an episode's record, (`kernels.RECORD_SIZE`,).
+        """Draw an episode's record (`kernels.RECORD_SIZE`,): a frame (600, 900, 3) uint8.
 
-        Returns
-        -------
-        NDArray | None
-            The frame, (600, 900, 3) uint8, for "rgb_array"; None for "human".
+        None for "human", which shows the frame in the window.
         """
         self.follow(record)
         if self.render_mode == "human" and self._window.dismissed:

@@ -36,18 +36,9 @@ PIECE = 16
 
 
 class Track:
-    """A path, prepared for many frames.
+    """A path and its corridor of a half width (m), prepared for many frames.
 
-    Parameters
-    ----------
-    path
-        Reference path.
-    half_width
-        Half width of the corridor, m.
-    colour
-        Quantity that colours the path, one of `COLOURINGS`.
-    letters
-        Renderer of text.
+    `colour` is the quantity that colours the path, one of `COLOURINGS`.
     """
 
     def __init__(
@@ -173,18 +164,12 @@ def _visible_runs(points: Array, view: View, margin: float) -> list[NDArray[np.i
 
 
 class Scenery(NamedTuple):
-    """Roads around a path.
-
-    Parameters
-    ----------
-    surfaces
-        Polygons, each (n, 2) m with n >= 3.
-    lines
-        Pairs of a polyline (n, 2) m with n >= 2, and whether it is dashed.
-    """
+    """Roads around a path."""
 
     surfaces: Sequence[ArrayLike]
+    """Polygons, each (n, 2) m with n >= 3."""
     lines: Sequence[tuple[ArrayLike, bool]]
+    """Polylines, each (n, 2) m with n >= 2, and True for a dashed one."""
 
 
 class SceneryDrawing:

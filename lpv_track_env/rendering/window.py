@@ -16,16 +16,10 @@ IDLE = 20
 class Window:
     """Window that the first frame opens; it can be resized, and frames keep their shape.
 
-    Space pauses until it is pressed again; Escape, or closing the window, ends the drawing for
-    good. Without a display SDL draws invisibly: the window warns once and does not wait for real
-    time.
-
-    Parameters
-    ----------
-    fps
-        Largest number of frames per second.
-    otherwise
-        Advice for users without a display, for the messages.
+    It shows at most `fps` frames per second. Space pauses until it is pressed again; Escape, or
+    closing the window, ends the drawing for good. Without a display SDL draws invisibly: the window
+    warns once, with `otherwise` as advice, and does not wait for real time. If SDL has no video
+    driver at all, a RuntimeError is raised.
     """
 
     def __init__(self, fps: int, otherwise: str = "use render_mode='rgb_array'") -> None:
