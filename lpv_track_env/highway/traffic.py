@@ -253,7 +253,7 @@ class TrafficReference:
         self._lowered = False
 
     def update(self, arc_length: float, speed: float, others: Sequence[RoadObject]) -> None:
-        """Find the vehicle ahead of an arc length (m), and lower the speeds (m/s) to keep the gap."""
+        """Find the vehicle ahead of an arc length (m), and keep the gap to it from a speed (m/s)."""
         ahead = leaders(
             self.path, arc_length, self._front, self._half_width, others, self._settings
         )
