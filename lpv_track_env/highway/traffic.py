@@ -253,7 +253,10 @@ class TrafficReference:
         self._lowered = False
 
     def update(self, arc_length: float, speed: float, others: Sequence[RoadObject]) -> None:
-        """Find the vehicle ahead of an arc length (m), and keep the gap to it from a speed (m/s)."""
+        """Find the vehicle ahead, and lower the reference's speeds to keep the gap.
+
+        This vehicle is at `arc_length` (m) and drives at `speed` (m/s).
+        """
         ahead = leaders(
             self.path, arc_length, self._front, self._half_width, others, self._settings
         )
