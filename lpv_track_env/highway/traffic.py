@@ -217,16 +217,9 @@ def _along_lanes(other: ControlledVehicle, distance: float) -> tuple[Array, floa
 class TrafficReference:
     """Reference of a vehicle in traffic: a path's table whose speeds keep the gap.
 
-    Parameters
-    ----------
-    path
-        Path to follow, at its own speed on a free road.
-    vehicle
-        Vehicle whose body counts for gaps.
-    layout
-        Layout of the observation: the speeds are lowered at least as far as its preview reaches.
-    cruise
-        Settings of the gap; None keeps the path's own speed regardless of traffic.
+    The speeds are lowered at least as far as the preview of `layout` reaches. `vehicle` is the
+    driven one, whose body counts for gaps; `cruise` None keeps the path's own speed regardless of
+    traffic.
 
     Attributes
     ----------

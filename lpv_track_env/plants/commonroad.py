@@ -92,13 +92,9 @@ def recompiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function of another package, and the functions of that package that it calls.
 
     numba compiles a call only if the called function is compiled itself. So each function is bound
-    anew, its code unchanged, to globals that contain the compiled functions.
-
-    Parameters
-    ----------
-    function
-        A plain function of numbers, arrays and lists of floats. So are the functions that it calls,
-        by their names or as attributes of modules.
+    anew, its code unchanged, to globals that contain the compiled functions. All of them must be
+    plain functions of numbers, arrays and lists of floats, called by their names or as attributes
+    of modules.
     """
     compiled: Callable[..., Any] = _Recompiler(_package(function.__module__)).function(function)
     return compiled
