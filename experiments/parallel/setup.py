@@ -196,9 +196,7 @@ class Setup:
         return PathTrackingEnv(
             self.trajectory,
             self.vehicle,
-            conditions=SIMULATION
-            if conditions is None
-            else conditions.replace(computing_delay=0.0),
+            conditions=conditions.replace(computing_delay=0.0) if conditions else SIMULATION,
             control_period=self.period,
             preview_steps=PREVIEW_STEPS,
             preview_period=PREVIEW_PERIOD,

@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from experiments.report.cost import TRAINED_NOTE
-from experiments.report.drives import Result, family_of, main_family, per_setting
+from experiments.report.drive_figures import condition_styles
+from experiments.report.drives import family_of, main_family, per_setting
 from experiments.report.page import (
     Cell,
     Document,
@@ -17,11 +18,10 @@ from experiments.report.page import (
     paragraph,
 )
 from experiments.report.svg_charts import BOTTOM, TOP, Chart, Scale, decades
-from experiments.report.tracking import condition_styles
 from experiments.run import published, tables
 from experiments.run.agent_tables import BAND_NOTE, Line, band_lines, band_ranges
 from experiments.run.metrics import BANDS
-from experiments.run.tables import EFFORT, FURTHER, TRACKING, Column, Estimate, Row, Setting
+from experiments.run.tables import EFFORT, FURTHER, TRACKING, Column, Estimate, Result, Row, Setting
 
 ERRORS = (
     ("ale", "ALE (m)", "Average lateral error"),

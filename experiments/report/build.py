@@ -8,13 +8,14 @@ from typing import Any
 from experiments.report import drive_replay
 from experiments.report.agent_comparison import comparison_section, curvature_section
 from experiments.report.cost import computing_section, learning_section
-from experiments.report.drives import Result, drives_of, in_families
+from experiments.report.drive_figures import figure_sections
+from experiments.report.drives import drives_of, in_families
 from experiments.report.page import Document, html_table, joined, line_styles, paragraph
 from experiments.report.sideslip import sideslip_section
 from experiments.report.summary import failures_section, summary_section
-from experiments.report.tracking import figure_sections
 from experiments.run import tables
 from experiments.run.store import ResultStore
+from experiments.run.tables import Result
 from trajectories.fileio import write_atomically
 
 ERRATA = (

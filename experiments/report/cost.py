@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.report.drives import Drive, Result, by_setting, family_of
+from experiments.report.drives import Drive, by_setting, family_of
 from experiments.report.page import (
     Document,
     Panel,
@@ -19,7 +19,7 @@ from experiments.report.page import (
 )
 from experiments.report.svg_charts import Chart, Scale, decades
 from experiments.run.learning_cost import UNKNOWN, duration
-from experiments.run.tables import trainings
+from experiments.run.tables import Result, trainings
 
 Array = NDArray[np.float64]
 

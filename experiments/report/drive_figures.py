@@ -1,18 +1,35 @@
-"""Figures of drives, a panel for each trajectory: paths from above, quantities over time."""
+"""Sections of figures: driven paths, errors and quantities over time, other settings.
+
+A figure has a panel for each trajectory.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.figures import COLOURS
 from experiments.report.drives import (
     Drive,
+    Family,
     by_trajectory,
+    families,
     foot_points,
     longest_trace,
     reference_line,
 )
-from experiments.report.page import LineStyle, Panel
+from experiments.report.page import (
+    DASHES,
+    Document,
+    LineStyle,
+    Panel,
+    Styles,
+    folded,
+    joined,
+    legend,
+    paragraph,
+)
 from experiments.report.svg_charts import (
     BOTTOM,
     LEFT,
@@ -25,20 +42,27 @@ from experiments.report.svg_charts import (
     exactly,
     spread,
 )
+from experiments.run import tables
+from experiments.run.tables import Result
 from lpv_track_env.bicycle import PSI, VX, X, Y
 
 Array = NDArray[np.float64]
+StyleOf = Callable[[Drive], LineStyle]
+Draw = Callable[[Sequence[Drive], StyleOf], list[Panel]]
 
-HEIGHT = 260.0
-"""Height of a view from above; of a chart over time, `FLAT`."""
-FLAT = 170.0
+HEIGHT, FLAT = 260.0, 170.0
+"""Heights of a view from above and of a chart over time."""
 ELONGATED = 0.08
 """Ratio of a path's extents below which it would look like a line on equal scales."""
-MAGNIFIED = 0.06
+MAGNIFIED_SHARE = 0.06
 """Share of a path's extent to which the largest deviation is magnified."""
 POINTS = 600
-
-StyleOf = Callable[[Drive], LineStyle]
+"""Points of a path that are drawn."""
+CONDITIONS = (LineStyle(0, 0, 2.2), LineStyle(1, 0, 1.2))
+"""Styles of the first and the second conditions; further ones take the next colours."""
+MARKS = "The broad grey line is the reference, ● its start; × marks a drive that ended early."
+MAGNIFIED = "Lateral errors are multiplied by the factor above the panel."
+YAW = "The broad grey line is the path's heading at the foot points of the first drive."
 
 
 def paths(drives: Sequence[Drive], style_of: StyleOf) -> list[Panel]:
@@ -55,7 +79,7 @@ def magnified(drives: Sequence[Drive], style_of: StyleOf) -> list[Panel]:
     for name, group in by_trajectory(drives).items():
         x, y = reference_line(group)
         largest = max(float(np.abs(drive.trace["lateral_error"]).max()) for drive in group)
-        factor = _round_down(MAGNIFIED * max(np.ptp(x), np.ptp(y)) / max(largest, 1e-6))
+        factor = _round_down(MAGNIFIED_SHARE * max(np.ptp(x), np.ptp(y)) / max(largest, 1e-6))
         lines = {id(drive): _driven(drive, factor) for drive in group}
         panels.append(Panel(f"{name}, deviations ×{factor:g}", _plan(group, style_of, lines)))
     return panels
@@ -127,28 +151,18 @@ def _plan_scales(x: Array, y: Array) -> tuple[tuple[Scale, Scale], bool]:
     return (first, second), equal
 
 
-def lateral_error(drives: Sequence[Drive], style_of: StyleOf) -> list[Panel]:
-    """Draw the lateral error over time."""
-    return _over_time(drives, style_of, FLAT, ("lateral_error", "lateral error (m)"))
-
-
-def heading_error(drives: Sequence[Drive], style_of: StyleOf) -> list[Panel]:
-    """Draw the heading error over time."""
-    return _over_time(drives, style_of, FLAT, ("heading_error", "heading error (rad)"))
-
-
-def inputs(drives: Sequence[Drive], style_of: StyleOf) -> list[Panel]:
-    """Draw steering angle and, below it, acceleration in force, over time."""
-    quantities = ("steering_angle", "steering (rad)"), ("acceleration", "accel. (m/s²)")
-    return _over_time(drives, style_of, 135.0, *quantities)
-
-
 def _over_time(
-    drives: Sequence[Drive], style_of: StyleOf, height: float, *quantities: tuple[str, str]
+    height: float, quantities: Mapping[str, str], drives: Sequence[Drive], style_of: StyleOf
 ) -> list[Panel]:
-    """Draw arrays of the traces, (name, axis label) each, one chart below the other."""
+    """Draw arrays of the traces over time, one chart below the other.
+
+    `quantities` gives the axis label of each array.
+    """
     return [
-        Panel(name, "".join(_time_chart(group, style_of, height, *one) for one in quantities))
+        Panel(
+            name,
+            "".join(_time_chart(group, style_of, height, *one) for one in quantities.items()),
+        )
         for name, group in by_trajectory(drives).items()
     ]
 
@@ -209,3 +223,169 @@ def speed(drives: Sequence[Drive], style_of: StyleOf) -> list[Panel]:
             chart.course(drive.trace["arc_length"], values, style.kind, style.width)
         panels.append(Panel(name, chart.svg()))
     return panels
+
+
+LATERAL_ERROR: tuple[str, str, Draw] = (
+    "Lateral error over time",
+    "Left of the path is positive. Scales differ between panels.",
+    partial(_over_time, FLAT, {"lateral_error": "lateral error (m)"}),
+)
+ERRORS: tuple[tuple[str, str, Draw], ...] = (
+    LATERAL_ERROR,
+    (
+        "Orientation error over time",
+        "Vehicle's heading minus the path's, in (−π, π]; on bends sideslip keeps it from zero.",
+        partial(_over_time, FLAT, {"heading_error": "heading error (rad)"}),
+    ),
+)
+"""Title, remark and function of each figure."""
+INPUTS = {"steering_angle": "steering (rad)", "acceleration": "accel. (m/s²)"}
+DRIVING: tuple[tuple[str, str, Draw], ...] = (
+    ("Speed over arc length", "The broad grey line is the path's reference speed.", speed),
+    (
+        "Inputs over time",
+        "Steering angle and acceleration in force, after the actuators.",
+        partial(_over_time, 135.0, INPUTS),
+    ),
+)
+
+
+def condition_styles(names: Sequence[str]) -> dict[str, LineStyle]:
+    """Return the style of each kind of conditions."""
+    n = len(COLOURS)
+    return {
+        name: CONDITIONS[k] if k < len(CONDITIONS) else LineStyle(k % n, k // n % DASHES)
+        for k, name in enumerate(names)
+    }
+
+
+def figure_sections(
+    document: Document, drives: Sequence[Drive], missing: Sequence[Result], styles: Styles
+) -> None:
+    """Add the sections of figures over paths and time.
+
+    With several kinds of conditions the leading agent's figures compare them, and those of the
+    other agents are folded away. With one, all agents share the panels.
+    """
+    found = families(drives)
+    note = _not_drawn(drives, missing)
+    if not found:
+        document.section("Paths and yaw", note)
+        return
+    main, *others = found
+    document.section("Paths and yaw", joined([note, _paths_section(document, main, styles)]))
+    document.section("Errors over time", _errors_section(document, main, styles))
+    document.section("Other settings", _other_settings(document, others, styles))
+
+
+def _not_drawn(drives: Sequence[Drive], missing: Sequence[Result]) -> str:
+    """State which seeds are drawn, and which cases cannot be."""
+    parts = []
+    if any(drive.case.get("seed") for drive in drives):
+        parts.append(paragraph("Of several seeds only the first is drawn."))
+    if missing:
+        names = ", ".join(
+            f"{tables.label_of(case)} on {case.get('trajectory')} (seed {case.get('seed')})"
+            for case in missing
+        )
+        parts.append(paragraph(f"Not drawn, because their traces cannot be read: {names}.", "bad"))
+    return joined(parts)
+
+
+def _by_label(styles: Styles) -> StyleOf:
+    return lambda drive: styles[drive.label]
+
+
+def _by_conditions(styles: Styles) -> StyleOf:
+    return lambda drive: styles[drive.conditions]
+
+
+def _paths_section(document: Document, family: Family, styles: Styles) -> str:
+    conditions = family.conditions
+    if len(conditions) < 2:
+        shown = legend(styles, family.labels)
+        where = f"{family.name}, {conditions[0]}"
+        return _path_figures(document, family.drives, where, _by_label(styles), shown)
+    kinds = condition_styles(conditions)
+    shown, style_of = legend(kinds, kinds), _by_conditions(kinds)
+    compared = " and ".join(conditions)
+    lead, *others = family.labels
+    parts = [
+        paragraph(f"{family.name}; {compared}, one seed each."),
+        _path_figures(document, family.of(lead), f"{lead}, {compared}", style_of, shown),
+    ]
+    folds = [
+        document.figure(
+            f"Driven paths, {label}, {compared}.",
+            paths(family.of(label), style_of),
+            shown,
+        )
+        for label in others
+    ]
+    if folds:
+        parts.append(folded(f"Paths of the other agents ({len(folds)} figures)", joined(folds)))
+    return joined(parts)
+
+
+def _path_figures(
+    document: Document, drives: Sequence[Drive], where: str, style_of: StyleOf, shown: str
+) -> str:
+    """Return figures of driven paths, to scale and magnified, and of yaw."""
+    figures: tuple[tuple[str, Draw], ...] = (
+        (f"Driven paths, {where}. {MARKS}", paths),
+        (f"Driven paths with deviations magnified, {where}. {MAGNIFIED}", magnified),
+        (f"Yaw over time, {where}. {YAW}", yaw),
+    )
+    return joined(
+        document.figure(caption, draw(drives, style_of), shown) for caption, draw in figures
+    )
+
+
+def _errors_section(document: Document, family: Family, styles: Styles) -> str:
+    """Return errors of the leading agent under all conditions, then of all agents under each."""
+    parts: list[str] = []
+    kinds = condition_styles(family.conditions)
+    lead = family.labels[0]
+    if len(kinds) > 1:
+        own, style_of = family.of(lead), _by_conditions(kinds)
+        parts += [
+            document.figure(f"{title}, {lead}. {remark}", draw(own, style_of), legend(kinds, kinds))
+            for title, remark, draw in (*ERRORS, *DRIVING)
+        ]
+    for conditions in family.conditions:
+        group, style_of = family.under(conditions), _by_label(styles)
+        labels = {drive.label for drive in group}
+        if len(kinds) > 1 and labels == {lead}:
+            continue
+        figures = ERRORS if len(kinds) > 1 else (*ERRORS, *DRIVING)
+        parts += [
+            document.figure(
+                f"{title}, every agent, {conditions}. {remark}",
+                draw(group, style_of),
+                legend(styles, labels),
+            )
+            for title, remark, draw in figures
+        ]
+    return joined(parts)
+
+
+def _other_settings(document: Document, others: Sequence[Family], styles: Styles) -> str:
+    """Return paths and lateral errors of all families but the first, folded away."""
+    title, remark, draw = LATERAL_ERROR
+    style_of = _by_label(styles)
+    parts = []
+    for family in others:
+        figures = []
+        for conditions in family.conditions:
+            group = family.under(conditions)
+            shown = legend(styles, {drive.label for drive in group})
+            where = f"{family.name}, {conditions}"
+            figures += [
+                document.figure(caption, plots(group, style_of), shown)
+                for caption, plots in (
+                    (f"Driven paths, {where}. {MARKS}", paths),
+                    (f"{title}, {where}. {remark}", draw),
+                )
+            ]
+        parts.append(folded(f"{family.name} ({len(figures)} figures)", joined(figures)))
+    return joined(parts)

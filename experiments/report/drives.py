@@ -3,7 +3,7 @@
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +12,13 @@ import trajectories
 from experiments.report.page import first_open
 from experiments.run import tables
 from experiments.run.store import ResultStore
-from experiments.run.tables import Setting
+from experiments.run.tables import Result, Setting
 from lpv_track_env import vehicle
 from lpv_track_env.bicycle import PSI, X, Y
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 
 Array = NDArray[np.float64]
-Result = Mapping[str, Any]
 Key = TypeVar("Key", bound=Hashable)
 
 TRACE = (

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from experiments.report.drive_figures import POINTS, reference_chart
 from experiments.report.drives import (
     Drive,
-    Result,
     by_setting,
     by_trajectory,
     plant,
@@ -27,6 +26,7 @@ from experiments.report.page import (
 )
 from experiments.report.svg_charts import Chart, around, decimate, exactly, spread
 from experiments.run import tables
+from experiments.run.tables import Result
 from lpv_track_env.bicycle import VX, VY, X, Y
 from lpv_track_env.vehicle import VehicleParameters
 
