@@ -14,6 +14,7 @@ from rich.table import Table
 
 from experiments.parallel.child_processes import READY, Child, Link, quiet
 from experiments.parallel.mailbox import Mailbox, Message, Reader
+from experiments.parallel.recording import spread
 from experiments.parallel.setup import ESTIMATE
 
 VALUES = 1000
@@ -144,12 +145,7 @@ def bench_mailbox(console: Console) -> dict[str, Any]:
         rows.add_column(heading, justify="left" if not heading else "right")
     found: dict[str, Any] = {}
     for way in WAYS:
-        latencies = measure(way, VALUES)
-        figures = {
-            "median": float(np.median(latencies)),
-            "p99": float(np.percentile(latencies, 99)),
-            "max": float(latencies.max()),
-        }
+        figures = spread(measure(way, VALUES)) or {}
         found[way] = figures
         rows.add_row(way, *(f"{1e6 * value:.1f}" for value in figures.values()))
     console.print(rows)

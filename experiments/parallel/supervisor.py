@@ -4,6 +4,7 @@ import multiprocessing
 import signal
 import time
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from experiments.parallel.child_processes import (
 )
 from experiments.parallel.control import control
 from experiments.parallel.estimation import estimate
-from experiments.parallel.mailbox import Mailbox, Message, Reader
+from experiments.parallel.mailbox import Mailbox, Message
 from experiments.parallel.recording import Outcome, Recording
 from experiments.parallel.setup import (
     COMMAND,
@@ -49,26 +50,21 @@ def run(setup: Setup, say: Say) -> Outcome:
     ValueError
         Outside of the main thread, the only one that handles signals.
     """
-    with Stop() as stop:
-        supervisor = Supervisor(setup, stop)
-        try:
-            supervisor.start(say)
-            return supervisor.drive()
-        finally:
-            supervisor.close()
+    with Stop() as stop, ExitStack() as resources:
+        supervisor = Supervisor(setup, stop, resources)
+        supervisor.start(say)
+        return supervisor.drive()
 
 
 class Supervisor:
-    """Vehicle, mailboxes and child processes of one run."""
+    """Vehicle of one run, and the mailboxes and child processes, which `resources` removes."""
 
-    def __init__(self, setup: Setup, stop: Stop) -> None:
-        self.setup, self._stop = setup, stop
+    def __init__(self, setup: Setup, stop: Stop, resources: ExitStack) -> None:
+        self.setup, self._stop, self._resources = setup, stop, resources
         self._vehicle = Vehicle(setup)
         self._sensors = Sensors(setup.known_conditions, setup.fix_ms, setup.seed)
         self._recording = Recording()
         self._children: list[Child] = []
-        self._mailboxes: list[Mailbox] = []
-        self._readers: list[Reader] = []
         self._fault = ""
         self._origin = 0
         self._sample = np.zeros((), SAMPLE)
@@ -80,23 +76,25 @@ class Supervisor:
     def start(self, say: Say) -> None:
         """Start both processes and wait until they are ready; keep a failure as the fault."""
         context = multiprocessing.get_context("spawn")
-        for dtype, slots in ((SAMPLE, SAMPLE_SLOTS), (ESTIMATE, 4), (COMMAND, 4)):
-            self._mailboxes.append(Mailbox(dtype, slots=slots))
-        samples, estimates, commands = self._mailboxes
+        mailboxes = samples, estimates, commands = [
+            self._resources.enter_context(closing(Mailbox(dtype, slots=slots)))
+            for dtype, slots in ((SAMPLE, SAMPLE_SLOTS), (ESTIMATE, 4), (COMMAND, 4))
+        ]
         self._samples = samples.writer.open()
         self._commands = commands.reader.open()
-        self._estimates = estimates.passive_reader().open()
-        self._readers.append(self._estimates)
+        self._estimates = self._resources.enter_context(estimates.passive_reader())
         for name, role, ends in (
             ("estimator", estimate, (samples.reader, estimates.writer)),
             ("controller", control, (estimates.reader, commands.writer)),
         ):
-            self._children.append(Child(name, context, role, (self.setup, *ends)))
+            child = Child(name, context, role, (self.setup, *ends))
+            self._resources.callback(child.end)
+            self._children.append(child)
         # Only the children hold these ends, so that each sees when the other is gone.
         for end in (samples.reader, estimates.writer, estimates.reader, commands.writer):
             end.close()
         if self._all_report(ATTACHED):
-            for mailbox in self._mailboxes:
+            for mailbox in mailboxes:
                 mailbox.unlink()
         if self._all_report(READY):
             names = [f"{child.name} {child.process.pid}" for child in self._children]
@@ -250,12 +248,3 @@ class Supervisor:
         if answered + 1 >= len(self._publish_times):
             return 0.0
         return 1e-9 * (time.monotonic_ns() - self._publish_times[answered + 1])
-
-    def close(self) -> None:
-        """End both processes and remove the mailboxes, whatever their state."""
-        for child in self._children:
-            child.end()
-        for reader in self._readers:
-            reader.close()
-        for mailbox in self._mailboxes:
-            mailbox.close()

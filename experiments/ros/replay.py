@@ -28,7 +28,7 @@ from experiments.ros.topics import (
     WheelSpeed,
 )
 from lpv_track_env.conditions.layout import MAX_STEERING_OFFSET
-from lpv_track_env.estimation.estimator import Estimator, EstimatorSettings
+from lpv_track_env.estimation.estimator import Estimator
 from lpv_track_env.estimation.observer import PathObserver
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
@@ -228,12 +228,11 @@ def replay(
     observer: PathObserver,
     *,
     control_period: float = 0.05,
-    settings: EstimatorSettings | None = None,
 ) -> Replay:
     """Replay a recording in the frame of the path.
 
-    The estimator has the `vehicle`'s model and the `settings`. The `agent` is called every
-    `control_period` (s) with observations by `observer`, which observes the same path.
+    The estimator has the `vehicle`'s model. The `agent` is called every `control_period` (s) with
+    observations by `observer`, which observes the same path.
 
     Raises
     ------
@@ -248,7 +247,7 @@ def replay(
             f"{recording.file}: the drive begins {distance:.0f} m from the path: "
             "give its own path, or the path's datum with --datum"
         )
-    estimator = Estimator(vehicle, settings, period=min(control_period, 0.02))
+    estimator = Estimator(vehicle, period=min(control_period, 0.02))
     feeder = _Feeder(recording, stamp, estimator)
     inputs = feeder.inputs
     estimator.begin(0.0, x, y, heading, speed)

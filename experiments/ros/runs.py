@@ -29,13 +29,11 @@ DATUM = (45.0, 10.0, 0.0)
 START = SECOND
 """Stamp of a run's start, ns, in simulation time; ROS takes 0 for "not set"."""
 FIX_PERIOD = 0.1
-"""Period of fixes, s; receivers give 10 positions a second."""
+"""Time between fixes, s, rounded to whole control periods; receivers give 10 positions a second."""
 STANDARD_GRAVITY = 9.80665
 
 
-def topics_of(
-    trace: Trace, *, datum: GeoPoint = DATUM, start: int = START, fix_period: float = FIX_PERIOD
-) -> dict[str, Topic]:
+def topics_of(trace: Trace, *, datum: GeoPoint = DATUM) -> dict[str, Topic]:
     """Return the true values of a run as topics by name, as perfect sensors would measure them.
 
     Parameters
@@ -45,10 +43,6 @@ def topics_of(
         averaged over the periods before and after.
     datum
         Position of x = y = 0; x points east there, y north.
-    start
-        Stamp of the trace's time 0, ns.
-    fix_period
-        s between fixes; rounded to whole control periods, at least one.
 
     Returns
     -------
@@ -59,15 +53,13 @@ def topics_of(
     Raises
     ------
     ValueError
-        For a datum that is not on Earth, or a period that is not positive.
+        For a datum that is not on Earth.
     """
     check_datum(datum)
-    if not fix_period > 0.0:
-        raise ValueError(f"the fixes' period must be positive, not {fix_period} s")
-    stamp = start + np.rint(trace.time * SECOND).astype(np.int64)
+    stamp = START + np.rint(trace.time * SECOND).astype(np.int64)
     vx, vy, heading, yaw_rate, x, y = trace.state.T
     forward, leftward = np.gradient(vx, trace.time), np.gradient(vy, trace.time)
-    stride = max(round(fix_period / float(np.median(np.diff(trace.time)))), 1)
+    stride = max(round(FIX_PERIOD / float(np.median(np.diff(trace.time)))), 1)
     level = np.column_stack([x, y, np.zeros_like(x)])[::stride]
     latitude, longitude, height = geodetic(level, datum)
     topics: tuple[Topic, ...] = (

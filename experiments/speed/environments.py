@@ -174,7 +174,7 @@ def stepping(env: Any, actions: NDArray[Any]) -> Run:
 
 
 def random_actions(n: int) -> NDArray[np.float32]:
-    """Random actions (16, n, 2) [m/s^2, rad] within the bounds of the default vehicle."""
+    """Return random actions (16, n, 2) [m/s^2, rad] within the bounds of the default vehicle."""
     space = gymnasium.make(PATH_TRACKING, trajectory="straight").action_space
     space.seed(0)
     low, high = (np.asarray(getattr(space, side)) for side in ("low", "high"))

@@ -91,7 +91,7 @@ class Series:
     rounds: list[float] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
-        """All fields, with the statistics of the rounds."""
+        """Return all fields and the statistics of the rounds."""
         return {
             "name": self.name,
             "unit": self.unit,
@@ -109,7 +109,7 @@ class Comparison:
     other: Series
 
     def as_dict(self) -> dict[str, Any]:
-        """Names and settings of both series, the ratio of each round, and its statistics."""
+        """Return names and settings of both series, the ratio of each round, and its statistics."""
         # An interrupted run has the last round of some series only.
         pairs = zip(self.ours.rounds, self.other.rounds, strict=False)
         rounds = [other / max(ours, SHORTEST) for ours, other in pairs]
@@ -160,7 +160,7 @@ class Section:
         return made
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, without series that have no round yet."""
+        """Return plain values for JSON, without series that have no round yet."""
         return {
             "title": self.title,
             "notes": list(self.notes),
@@ -175,7 +175,7 @@ class Section:
 
 
 def summary(rounds: Sequence[float]) -> dict[str, float]:
-    """Median, minimum and maximum, and from `MANY` rounds on the 99th percentile; {} if empty."""
+    """Return median, minimum, maximum and, from `MANY` rounds on, the 99th percentile; or {}."""
     if not rounds:
         return {}
     found = {"median": np.median(rounds), "min": np.min(rounds), "max": np.max(rounds)}

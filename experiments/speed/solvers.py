@@ -127,19 +127,17 @@ def solvers(section: Section, effort: Effort, tick: Tick) -> None:
         f"loop on {' and '.join(effort.trajectories)}, each started 0.2 m off the path; the first "
         "solve of a window is a series of its own. A ratio is that of two medians over one window."
     )
-    _over_windows(section, effort, tick, HORIZON, effort.windows, effort.repeats)
+    _over_windows(section, effort, tick, HORIZON, effort.windows)
 
 
 def horizons(section: Section, effort: Effort, tick: Tick) -> None:
     """Measure every solver over the horizon N."""
     section.notes.append("As above, on one window of each trajectory per horizon of N periods.")
     for horizon in effort.horizons:
-        _over_windows(section, effort, tick, horizon, 1, effort.repeats)
+        _over_windows(section, effort, tick, horizon, 1)
 
 
-def _over_windows(
-    section: Section, effort: Effort, tick: Tick, horizon: int, windows: int, repeats: int
-) -> None:
+def _over_windows(section: Section, effort: Effort, tick: Tick, horizon: int, windows: int) -> None:
     """Measure every solver on every window in turn: each solve, and each window's median.
 
     A window's first solve has no warm start and is kept apart: there is one per episode.
@@ -155,7 +153,7 @@ def _over_windows(
         )
         series[label] = warm, cold, median
         solve_times(agent, recorded[0])  # compiles, fills caches
-    for window in recorded * repeats:
+    for window in recorded * effort.repeats:
         for label, agent in made.items():
             first, *others = solve_times(agent, window)
             tick(f"solvers in turn: {', '.join(made)}, horizon {horizon}")
