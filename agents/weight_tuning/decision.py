@@ -103,7 +103,7 @@ class Decider:
         weights_for_all(
             actions, mask, bands, p.sets, p.matrix, p.log_span, p.catalogue, memory.tables, rejected
         )
-        memory.history[np.ix_(mask, [CLOCK, FAILURES, ITERATIONS])] = 0.0
+        memory.history[np.ix_(mask, np.array([CLOCK, FAILURES, ITERATIONS]))] = 0.0
         return rejected
 
 
