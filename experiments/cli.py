@@ -36,6 +36,15 @@ COMMANDS = {
 """Commands and their summaries; a command's module is `experiments.commands.NAME`."""
 
 
+class Parser(argparse.ArgumentParser):
+    """Parser for options with two names: `--traj` is short for both, not ambiguous."""
+
+    def _get_option_tuples(self, option_string: str) -> list[Any]:
+        # Python 3.11 refuses a prefix of two names even if they belong to one option.
+        found = super()._get_option_tuples(option_string)
+        return list({option[0]: option for option in found}.values())
+
+
 def module_of(command: str) -> Any:
     """Import and return a command's module, see `experiments.commands`."""
     return importlib.import_module(f"experiments.commands.{command.replace('-', '_')}")
@@ -43,7 +52,7 @@ def module_of(command: str) -> Any:
 
 def parser(declared: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
     """Return the parser of `lpv-track`: all commands, with the options of those `declared`."""
-    root = argparse.ArgumentParser(
+    root = Parser(
         prog="lpv-track",
         description="Path tracking with a dynamic bicycle: an LPV-NMPC and others, benchmarked.",
         epilog="example: lpv-track benchmark --suite quick --out results/quick",

@@ -46,8 +46,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--laps", type=int, default=1, metavar="N", help="default 1")
     parser.add_argument("--conditions", default="simulation", metavar="NAME")
     parser.add_argument("--control-period", type=float, default=0.05, metavar="S")
-    add_settings(parser, "--env", "settings of the environment")
-    add_agent_settings(parser)
+    add_settings(parser, "--env", "settings of the environment", nargs="*")
+    add_agent_settings(parser, nargs="*")
     parser.add_argument(
         "--video", type=Path, metavar="FILE",
         help="in place of the table a video, .mp4 or .gif, of the last seed; this project's "

@@ -67,9 +67,11 @@ def add_conditions(
     add_settings(parser, "--conditions-set", changes)
 
 
-def add_settings(parser: argparse.ArgumentParser, option: str, meaning: str | None = None) -> None:
+def add_settings(
+    parser: argparse.ArgumentParser, option: str, meaning: str | None = None, nargs: str = "+"
+) -> None:
     """Add an option that takes KEY=VALUE pairs; `parse_settings` reads them."""
-    parser.add_argument(option, nargs="+", default=[], metavar="KEY=VALUE", help=meaning)
+    parser.add_argument(option, nargs=nargs, default=[], metavar="KEY=VALUE", help=meaning)
 
 
 def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
@@ -160,10 +162,10 @@ def only_one(kind: str, names: Sequence[str]) -> str:
     return names[0]
 
 
-def add_agent_settings(parser: argparse.ArgumentParser) -> None:
+def add_agent_settings(parser: argparse.ArgumentParser, nargs: str = "+") -> None:
     """Add `--agent-set`; `agent_settings` reads it."""
     parser.add_argument(
-        "--agent-set", nargs="+", default=[], metavar="[NAME:]KEY=VALUE",
+        "--agent-set", nargs=nargs, default=[], metavar="[NAME:]KEY=VALUE",
         help="settings of every agent, or of the agent NAME alone, e.g. "
         'lpv-nmpc:weights={"Q":[1,1,20,20]}',
     )  # fmt: skip

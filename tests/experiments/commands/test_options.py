@@ -131,3 +131,17 @@ def test_rows_of_one_agent_with_other_settings_are_told_apart(tmp_path: Path) ->
         ("stanley", 1), ("stanley (gain=2.5)", 1), ("pid", 1),
     ]  # fmt: skip
     assert rows[0].values["ale"] != rows[1].values["ale"]
+
+
+@pytest.mark.parametrize(
+    ("given", "name", "values"),
+    [
+        (["drive", "--traj", "T1"], "trajectories", ["T1"]),
+        (["benchmark", "--traj", "T1", "T2"], "trajectories", ["T1", "T2"]),
+        (["benchmark", "--traj=T1"], "trajectories", ["T1"]),
+        (["benchmark", "--speed", "fixed"], "speed_modes", ["fixed"]),
+        (["highway", "--env", "--agent-set"], "agent_set", []),
+    ],
+)
+def test_short_forms_of_options(given: list[str], name: str, values: list[str]) -> None:
+    assert getattr(parser(given[:1]).parse_args(given), name) == values
