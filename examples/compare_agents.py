@@ -6,7 +6,6 @@ from collections import defaultdict
 import numpy as np
 from scipy.stats import t as student
 
-from experiments.run.case import run_case, worker_death
 from experiments.run.engines import local_pool
 
 
@@ -31,7 +30,7 @@ def main() -> None:
         for seed in range(options.seeds)
     ]
     values: dict[str, list[float]] = defaultdict(list)
-    for result in local_pool(specs, options.workers, run_case, worker_death):
+    for result in local_pool(specs, options.workers):
         if result["status"] != "ok":
             raise SystemExit(f"{result['agent']}, seed {result['seed']}: {result['error']}")
         values[result["agent"]].append(result["metrics"]["ale"])

@@ -119,7 +119,7 @@ def _run(
         results = (
             engines.in_process(specs, run, started)
             if workers == 1
-            else engines.local_pool(specs, workers, run, died, started)
+            else engines.local_pool(specs, workers, run, started, died)
         )
         for count, result in enumerate(results, start=1):
             # Before the result is stored: a case may have taken Ctrl-C for a failed solve.

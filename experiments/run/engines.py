@@ -60,9 +60,10 @@ class Interrupts:
 
 
 def in_process(
-    specs: Sequence[Spec], run: Run, started: Callable[[Spec], None] | None = None
+    specs: Sequence[Spec], run: Run | None = None, started: Callable[[Spec], None] | None = None
 ) -> Iterator[Result]:
-    """Run specs one after another in this process."""
+    """Run specs one after another in this process; `run` is by default that of `Case`."""
+    run = run or _run_case()
     for spec in specs:
         if started is not None:
             started(spec)
@@ -72,9 +73,9 @@ def in_process(
 def local_pool(
     specs: Sequence[Spec],
     workers: int,
-    run: Run,
-    died: Run,
+    run: Run | None = None,
     started: Callable[[Spec], None] | None = None,
+    died: Run | None = None,
 ) -> Iterator[Result]:
     """Run specs over `workers` processes and yield results as they end.
 
@@ -85,11 +86,12 @@ def local_pool(
     workers
         Number of processes.
     run
-        Function that makes a result; it must be picklable.
-    died
-        Function that makes the result of a spec that killed its worker twice.
+        Function that makes a result; it must be picklable. Default: that of `Case`.
     started
         Called with each spec as it starts.
+    died
+        Function that makes the result of a spec that killed its worker twice. Default: that of
+        `Case`.
 
     Raises
     ------
@@ -99,6 +101,7 @@ def local_pool(
     if workers < 1:
         raise ValueError(f"workers must be at least 1, not {workers}")
     one_thread()
+    run, died = run or _run_case(), died or _worker_death()
     waiting = list(specs)
     suspects: list[Spec] = []
     while waiting or suspects:
@@ -113,6 +116,19 @@ def local_pool(
             yield died(running[0])
         else:
             suspects += running
+
+
+def _run_case() -> Run:
+    # Imported late: cases load numerical libraries.
+    from experiments.run.case import run_case
+
+    return run_case
+
+
+def _worker_death() -> Run:
+    from experiments.run.case import worker_death
+
+    return worker_death
 
 
 def _begin_worker() -> None:

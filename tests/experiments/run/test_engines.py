@@ -95,7 +95,7 @@ def test_a_case_that_kills_its_worker_is_reported_and_no_other_suffers(
     workers: int, killers: list[int]
 ) -> None:
     cases = specs(3 * workers, killers=killers)
-    results = list(local_pool(cases, workers, run=kill_some, died=worker_death))
+    results = list(local_pool(cases, workers, run=kill_some))
     assert seeds(results) == list(range(3 * workers))
     failed = [result for result in results if result["status"] != "ok"]
     assert seeds(failed) == killers
@@ -122,6 +122,13 @@ def test_what_a_run_raises_comes_through_and_ends_the_pool() -> None:
         list(local_pool(specs(6), 2, run=raise_one, died=worker_death))
     assert workers_left() == []
     assert time.monotonic() - began < 60
+
+
+def test_cases_are_driven_unless_another_function_is_given() -> None:
+    (here,), (pooled,) = list(in_process(specs(1))), list(local_pool(specs(1), 1))
+    for result in (here, pooled):
+        assert result["status"] == "failed"
+        assert "unknown trajectory 'nowhere'" in result["error"]
 
 
 def test_in_process_passes_on_what_a_run_raises() -> None:
