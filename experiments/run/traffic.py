@@ -64,9 +64,14 @@ class TrafficCase(BaseCase):
 
     def drive(self, result: dict[str, Any]) -> None:
         """Drive the episode; add `end`, `metrics`, and `others`, the number of other vehicles."""
+        result["error"] = None
         env = self.make_env()
         result |= self._drive_own(env) if self.agent in OWN else self._drive_agent(env)
         env.close()
+
+    def failure(self, error: str) -> dict[str, Any]:
+        """Return the result of a case that failed."""
+        return {**super().failure(error), "others": None}
 
     def _drive_agent(self, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
         inner: Any = env.unwrapped

@@ -35,6 +35,7 @@ def test_agents_and_highway_envs_own_beside_each_other(
     }
     for one in results:
         assert one["status"] == "ok"
+        assert one["error"] is None
         assert one["end"] == "time_limit"
         assert one["metrics"]["duration"] == pytest.approx(2.0)
         assert one["metrics"]["lateral_max"] < 0.5
@@ -96,6 +97,7 @@ def test_a_drive_that_breaks_down_is_a_failed_one(tmp_path: Path) -> None:
     result = run_case({"agent": f"{file}:Broken"}, TrafficCase)
     assert result["status"] == "failed"
     assert result["error"] == "RuntimeError: no idea"
+    assert result["others"] is None
 
 
 @pytest.mark.parametrize(
