@@ -12,13 +12,18 @@ from trajectories.path import ReferencePath
 Array = NDArray[np.float64]
 
 
-def signed_waypoint_curvature(x: ArrayLike, y: ArrayLike) -> Array:
-    """Curvature (x'y'' - y'x'') / (x'^2 + y'^2)^(3/2) of waypoints, (n,) -> (n,), 1/m, left > 0.
+def waypoint_curvature(x: ArrayLike, y: ArrayLike) -> Array:
+    """Unsigned curvature |x'y'' - y'x''| / (x'^2 + y'^2)^(3/2) of waypoints, (n,) -> (n,), 1/m.
 
-    Its absolute value is the formula of kumar2025lpv, evaluated as the paper's figures suggest:
-    central differences, taken twice. At a kink of angle D between waypoints a distance d apart it
-    gives sin(D/2) / (d cos^2(D/2)) at the kink and sin(D) / (4 d) at both neighbours.
+    The formula of kumar2025lpv, evaluated as the paper's figures suggest: central differences,
+    taken twice. At a kink of angle D between waypoints a distance d apart it gives
+    sin(D/2) / (d cos^2(D/2)) at the kink and sin(D) / (4 d) at both neighbours.
     """
+    return np.abs(signed_waypoint_curvature(x, y))
+
+
+def signed_waypoint_curvature(x: ArrayLike, y: ArrayLike) -> Array:
+    """`waypoint_curvature` with its sign, positive to the left."""
     dx, dy = np.gradient(np.asarray(x, dtype=np.float64)), np.gradient(np.asarray(y, dtype=float))
     ddx, ddy = np.gradient(dx), np.gradient(dy)
     curvature: Array = (dx * ddy - dy * ddx) / (dx * dx + dy * dy) ** 1.5
@@ -124,3 +129,10 @@ class CurvatureBands:
             return band
         held = int(self.classify(sharpest / (1.0 - self.hysteresis)))
         return max(band, min(held, current))
+
+    def shares(self, path: ReferencePath) -> Array:
+        """Share of a path's length in each band, (len(self),)."""
+        once = path.curvature[:-1] if path.closed else path.curvature
+        counts = np.bincount(self.classify(once), minlength=len(self))
+        shares: Array = counts / counts.sum()
+        return shares

@@ -8,6 +8,7 @@ kernels that simulate the conditions.
 
 import dataclasses
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -221,6 +222,15 @@ class Conditions:
     def ranges(self) -> Array:
         """Both ends of every field that is drawn, shape (len(DRAWN), 2), in the order of DRAWN."""
         return np.array([self.ends(name) for name in DRAWN])
+
+    def departures(self) -> Iterator[tuple[str, object]]:
+        """Yield the fields that are not ideal, with their values."""
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            if item.name not in {"name", "estimator_settings"} and value != getattr(
+                IDEAL, item.name
+            ):
+                yield item.name, value
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trajectories import CurvatureBands, ReferencePath, load, statistics
-from trajectories.curvature import circle_curvature, signed_waypoint_curvature
+from trajectories import CurvatureBands, load, statistics
+from trajectories.curvature import circle_curvature, signed_waypoint_curvature, waypoint_curvature
 from trajectories.shapes import polyline
 
 
@@ -21,6 +21,7 @@ def test_circle(radius: float, sign: float) -> None:
     inner = signed_waypoint_curvature(x, y)[2:-2]
     # Central differences of step theta: kappa = 1 / (R sin theta / theta ...), relative O(theta^2).
     np.testing.assert_allclose(inner, sign / radius, rtol=(0.25 / radius) ** 2)
+    np.testing.assert_array_equal(waypoint_curvature(x, y)[2:-2], np.abs(inner))
 
 
 def test_ellipse() -> None:
@@ -100,18 +101,13 @@ def test_no_flicker_around_a_threshold() -> None:
     assert changes == 1
 
 
-def shares(path: ReferencePath) -> np.ndarray:
-    """Share of a path's length in each band, (4,)."""
-    once = path.curvature[:-1] if path.closed else path.curvature
-    return np.bincount(CurvatureBands().classify(once), minlength=4) / len(once)
-
-
 def test_shares_of_length() -> None:
-    np.testing.assert_array_equal(shares(load("circle")), [0, 0, 1, 0])
+    bands = CurvatureBands()
+    np.testing.assert_array_equal(bands.shares(load("circle")), [0, 0, 1, 0])
     for name in ("T1", "T6"):
-        assert shares(load(name)).sum() == pytest.approx(1.0)
-    assert shares(load("T6"))[3] == 0.0
-    assert shares(load("T4"))[3] > 0.1
+        assert bands.shares(load(name)).sum() == pytest.approx(1.0)
+    assert bands.shares(load("T6"))[3] == 0.0
+    assert bands.shares(load("T4"))[3] > 0.1
 
 
 @pytest.mark.parametrize(

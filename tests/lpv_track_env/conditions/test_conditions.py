@@ -60,6 +60,12 @@ def test_every_number_of_realtime_is_in_the_table() -> None:
         assert sorted(told) == pytest.approx(sorted(ends)), name
 
 
+def test_departures_from_ideal() -> None:
+    assert dict(IDEAL.departures()) == {}
+    changed = Conditions(steering_lag=0.1, estimator="raw")
+    assert dict(changed.departures()) == {"steering_lag": 0.1, "estimator": "raw"}
+
+
 def test_plain_values() -> None:
     stored = json.loads(json.dumps(REALTIME.as_dict()))
     assert stored["name"] == "realtime"
