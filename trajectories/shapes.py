@@ -21,16 +21,18 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
-from scipy.interpolate import BSpline, make_interp_spline
 from scipy.sparse.linalg import splu
 
 from trajectories.path import SPACING, ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 Array = NDArray[np.float64]
 Fit = TypeVar("Fit")
@@ -302,6 +304,8 @@ def smooth(points: Array, tolerance: float, *, closed: bool = False) -> Smoothed
     closed
         Whether the curve goes on from the last point to the first.
     """
+    from scipy.interpolate import make_interp_spline
+
     chain = np.vstack([points, points[:1]]) if closed else points
     at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(chain, axis=0).T))])
     if tolerance > 0.0:
@@ -313,7 +317,7 @@ def smooth(points: Array, tolerance: float, *, closed: bool = False) -> Smoothed
     return Smoothed(geometry, float(deviation.max()), float(np.sqrt(np.mean(deviation**2))))
 
 
-def _curve(spline: BSpline) -> Callable[[Array], Derivatives]:
+def _curve(spline: "BSpline") -> Callable[[Array], Derivatives]:
     """Return the coordinates and their derivatives as a function for `parametric`."""
     first, second = spline.derivative(), spline.derivative(2)
 
@@ -324,11 +328,13 @@ def _curve(spline: BSpline) -> Callable[[Array], Derivatives]:
     return curve
 
 
-def _penalised(points: Array, at: Array, tolerance: float, closed: bool) -> BSpline:
+def _penalised(points: Array, at: Array, tolerance: float, closed: bool) -> "BSpline":
     """Minimise |B c - points|^2 + penalty |D c|^2 over control points c, D third differences.
 
     The rms deviation grows with the penalty; take the largest penalty that keeps `tolerance`.
     """
+    from scipy.interpolate import BSpline
+
     length = float(at[-1])
     cells = int(np.ceil(length / max(float(np.median(np.diff(at))), LEAST_KNOT_SPACING)))
     cells = max(cells, DEGREE + 3)
