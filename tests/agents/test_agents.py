@@ -304,12 +304,13 @@ def test_another_kind_of_environment_is_refused() -> None:
 
 
 def test_stanley_loads_neither_casadi_nor_torch() -> None:
+    heavy = {"casadi", "torch", "stable_baselines3", "scipy.interpolate"}
     code = (
         "import sys, gymnasium, agents, lpv_track_env\n"
         "agents.names()\n"
         "env = gymnasium.make('lpv_track_env/PathTracking-v0', trajectory='straight')\n"
         "agents.make('stanley', env).predict(env.reset()[0])\n"
-        "print(sorted({'casadi', 'torch', 'stable_baselines3', 'scipy.interpolate'} & set(sys.modules)))\n"
+        f"print(sorted({heavy} & set(sys.modules)))\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
