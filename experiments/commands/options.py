@@ -180,8 +180,8 @@ def agent_settings(pairs: Sequence[str], agents: Iterable[str]) -> dict[str, dic
     ------
     ValueError
         For a NAME that is not among the agents; a setting that an agent does not know; and one that
-        is to hold for all agents although their defaults for it differ, such as the weights of
-        `lpv-nmpc` and `lpv-nmpc-tuned`: it would turn one agent into another.
+        is to hold for all agents although their defaults for it are different names or files, such
+        as the weights of `lpv-nmpc` and `lpv-nmpc-tuned`: it would turn one agent into another.
     """
     from agents.registry import check_settings, parameters_of
     from trajectories.naming import choose
@@ -197,11 +197,12 @@ def agent_settings(pairs: Sequence[str], agents: Iterable[str]) -> dict[str, dic
             common[key] = value
     for key in common:
         defaults = {
-            name: repr(known[key].default)
+            name: known[key].default
             for name in names
             if key not in own[name] and key in (known := parameters_of(name) or {})
         }
-        if len(set(defaults.values())) > 1:
+        named = any(isinstance(default, str | Path) for default in defaults.values())
+        if named and len({repr(default) for default in defaults.values()}) > 1:
             raise ValueError(
                 f"setting {key!r} has different defaults for {', '.join(defaults)}: say whose it "
                 f"is, as --agent-set {next(iter(defaults))}:{key}=..."

@@ -65,6 +65,12 @@ def test_what_tells_two_agents_apart_is_not_set_for_both(setting: str, agents: l
     assert agent_settings([f"{agents[0]}:{setting}=x.json"], agents)[agents[1]] == {}
 
 
+def test_numbers_are_set_for_all_agents_whatever_their_defaults() -> None:
+    agents = ["pure-pursuit", "pid"]
+    both = {"lookahead_wheelbases": 2}
+    assert agent_settings(["lookahead_wheelbases=2"], agents) == dict.fromkeys(agents, both)
+
+
 @pytest.mark.parametrize("command", ["benchmark", "drive"])
 @pytest.mark.parametrize(
     ("plural", "singular", "value"),
