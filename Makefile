@@ -6,10 +6,11 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup setup-dev setup-docs benchmark test lint docs clean
+.PHONY: help setup setup-dev setup-docs benchmark test test-fast lint docs clean
 help:
 	@echo "make benchmark   drive the paper's six trajectories, print the table, write results/benchmark/report.html"
 	@echo "make test        run the tests"
+	@echo "make test-fast   run the tests that take little time"
 	@echo "make lint        ruff, mypy and the import-direction contract"
 	@echo "make docs        the site, into build/site: open build/site/index.html"
 	@echo "make setup       the set-up of 'make benchmark' alone (setup-dev: that of test and lint; setup-docs)"
@@ -40,6 +41,9 @@ benchmark: setup
 
 test: setup-dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+test-fast: setup-dev
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
 
 lint: setup-dev
 	$(BIN)/ruff check .
