@@ -135,7 +135,7 @@ def drive(
     for driven in drives:
         _print_outcome(driven, console)
     if sink.outcome:
-        console.print(sink.outcome, markup=False, highlight=False, soft_wrap=True)
+        console.out(sink.outcome, highlight=False)
     return 0 if all(driven.finished for driven in drives) else 1
 
 
@@ -228,8 +228,8 @@ def _print_outcome(one: Drive, console: Console) -> None:
     assert one.done is not None
     trace = one.done.trace
     worst = float(np.abs(trace.lateral_error).max())
-    console.print(
+    console.out(
         f"{one.case.agent} on {one.case.place}: {one.done.end} after {trace.time[-1]:.1f} s, "
         f"largest lateral error {worst:.3f} m",
-        markup=False, highlight=False, soft_wrap=True,
-    )  # fmt: skip
+        highlight=False,
+    )

@@ -118,7 +118,7 @@ def finish(store: "ResultStore", cases: Sequence[Mapping[str, Any]], console: Co
     lines = [where(report)]
     if not complete:
         lines.append(f"cases: {store.cases_file}; all tables: lpv-track report {store.folder}")
-    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    console.out("\n".join(lines), highlight=False)
     return 1 if failed else 0
 
 

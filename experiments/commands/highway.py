@@ -120,7 +120,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     results = selected(store, specs, TrafficCase)
     console.print(table(options.agents, results))
     failed = print_failed(results, console)
-    console.print(f"written: {store.cases_file}", markup=False, highlight=False, soft_wrap=True)
+    console.out(f"written: {store.cases_file}", highlight=False)
     return 1 if failed else 0
 
 

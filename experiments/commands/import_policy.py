@@ -76,11 +76,11 @@ def run(options: argparse.Namespace, console: Console) -> int:
     }
     policy = policy_of(model, layout, vehicle, period, options.algorithm, training)
     write(policy, options.out)
-    console.print(
+    console.out(
         f"{options.algorithm}, {' -> '.join(map(str, policy.sizes))}: {options.out}; "
         f"lpv-track drive --agent {options.out} drives it",
-        markup=False, highlight=False, soft_wrap=True,
-    )  # fmt: skip
+        highlight=False,
+    )
     return 0
 
 

@@ -23,5 +23,5 @@ def run(options: argparse.Namespace, console: Console) -> int:
         raise ValueError(f"{options.folder} is not a folder of results")
     report = write_report(options.folder)
     console.print(all_tables(ResultStore(options.folder).cases()))
-    console.print(where(report), markup=False, highlight=False, soft_wrap=True)
+    console.out(where(report), highlight=False)
     return 0

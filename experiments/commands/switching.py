@@ -58,7 +58,7 @@ def spans_of(given: list[str]) -> tuple[float, ...]:
     ValueError
         For anything else than a number above 1 and at most 10000.
     """
-    from experiments.robustness.switching import WHOLE
+    from experiments.study.weight_switching import WHOLE
 
     spans = []
     for text in given:
@@ -99,20 +99,20 @@ def run(options: argparse.Namespace, console: Console) -> int:
     It drives every arm, prints the table and writes `switching.json`; arms in it are kept.
     """
     from agents.weights import HIGHEST, LOWEST
-    from experiments.robustness import switching
     from experiments.run.benchmark import progress_bar
     from experiments.run.provenance import provenance
+    from experiments.study import weight_switching
     from lpv_track_env import conditions
     from lpv_track_env.validation import checked_threads
     from trajectories.fileio import write_atomically
 
-    setup = switching.Setup(
+    setup = weight_switching.Setup(
         episodes=options.episodes, conditions=options.conditions, vehicle=options.vehicle,
         candidates=options.candidates, seed=options.seed, weights=base_of(options.weights),
         threads=checked_threads(options.threads),
     )  # fmt: skip
     conditions.load(setup.conditions)
-    arms = switching.arms_of(spans_of(options.spans))
+    arms = weight_switching.arms_of(spans_of(options.spans))
     options.out.mkdir(parents=True, exist_ok=True)
     file: Path = options.out / "switching.json"
     # Plain values equal to what JSON gives back, for the comparison with a file.
@@ -122,7 +122,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     result: dict[str, Any] = {
         "experiment": "switching",
         "setup": plain,
-        "window": switching.WINDOW,
+        "window": weight_switching.WINDOW,
         "bounds": [LOWEST, HIGHEST],
         "trajectories": setup.trajectories,
         "sources": _sources(),
@@ -130,13 +130,13 @@ def run(options: argparse.Namespace, console: Console) -> int:
         "arms": done,
     }
     kept = _kept(file, result)
-    batches = -(-setup.episodes // switching.BATCH)
+    batches = -(-setup.episodes // weight_switching.BATCH)
     with resumable(options, console), progress_bar(console) as progress:
         for number, arm in enumerate(arms, start=1):
             if arm.label not in kept:
                 bar = progress.add_task(arm.label, total=batches * setup.windows)
-                outcome = switching.drive_arm(setup, arm, partial(progress.advance, bar))
-                kept[arm.label] = switching.summary(outcome)
+                outcome = weight_switching.drive_arm(setup, arm, partial(progress.advance, bar))
+                kept[arm.label] = weight_switching.summary(outcome)
             done[arm.label] = {**arm.as_dict(), **kept[arm.label]}
             write_atomically(file, json.dumps(result, indent=1, allow_nan=False).encode())
             if not console.is_terminal:
@@ -146,16 +146,16 @@ def run(options: argparse.Namespace, console: Console) -> int:
                 )  # fmt: skip
     console.print(table(result))
     console.print(widest_kept(result))
-    console.print(f"written: {file}", markup=False, highlight=False, soft_wrap=True)
+    console.out(f"written: {file}", highlight=False)
     return 0
 
 
 def _sources() -> str:
     """Return a digest of the sources that a result depends on."""
-    from experiments.robustness import switching
     from experiments.run.case import project_digest
+    from experiments.study import weight_switching
 
-    own = Path(switching.__file__).read_text()
+    own = Path(weight_switching.__file__).read_text()
     return hashlib.sha256((project_digest() + own).encode()).hexdigest()[:16]
 
 
@@ -196,7 +196,7 @@ def table(result: Mapping[str, Any]) -> Table:
 
 def widest_kept(result: Mapping[str, Any]) -> str:
     """Return the widest span of each way to switch in which no vehicle was lost, in words."""
-    from experiments.robustness.switching import CONTROL, WHOLE
+    from experiments.study.weight_switching import CONTROL, WHOLE
 
     spans: dict[str, list[tuple[float, bool]]] = {}
     for row in result["arms"].values():

@@ -139,7 +139,7 @@ def settings_of(options: argparse.Namespace) -> "TrainingSettings":
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command and return its exit code."""
-    from experiments.jobs.console import Display, check_resume, need
+    from experiments.jobs.console import TrainingDisplay, check_resume, need
 
     need("training", "rl", "stable_baselines3", "torch", "tensorboard")
     from experiments.jobs.job import stored_settings
@@ -161,21 +161,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         elif options.steps is None:
             settings, at_most = fit_steps(settings, at_most, console)
 
-    class TrainingDisplay(Display):
-        """A line for every segment."""
-
-        def tick(self, done: int, words: str) -> None:
-            self.show(done, f"{settings.algorithm} {words}")
-
-        def line(self, line: "Line") -> None:
-            validation = line["validation"]
-            self.say(
-                f"{line['steps']:>11,} steps {line['seconds']:5.0f} s  "
-                f"loss {validation['loss']:7.4f}  finished {validation['finished']:4.0%}  "
-                f"ALE {validation['mean_ale']:.4f} m{'  best' if line['best'] else ''}"
-            )
-
-    display = TrainingDisplay(console, settings.steps)
+    display = TrainingDisplay(console, settings.algorithm, settings.steps)
     with resumable(options, console, "the same command with --resume"), display.progress:
         lines = train(
             settings, folder, display, command=command_line(settings, options),
@@ -183,12 +169,12 @@ def run(options: argparse.Namespace, console: Console) -> int:
         )  # fmt: skip
     last = lines[-1]
     draw(lines, folder / "training.png")
-    console.print(
+    console.out(
         f"{last['steps']:,} steps in {last['seconds']:.0f} s, {last['learning_seconds']:.0f} s of "
         f"them learning ({last['steps'] / last['learning_seconds']:,.0f} steps a second), "
         f"{last['solves']:,} NMPC solves; policy: {folder / POLICY}",
-        markup=False, highlight=False, soft_wrap=True,
-    )  # fmt: skip
+        highlight=False,
+    )
     return 0
 
 

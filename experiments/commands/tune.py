@@ -11,7 +11,6 @@ from experiments.commands.options import add_conditions, add_settings, parse_set
 from experiments.tuning import METHODS
 
 if TYPE_CHECKING:
-    from experiments.jobs.job import Line
     from experiments.tuning.settings import TuningSettings
 
 EXAMPLE = "lpv-track tune --method rl --seed 0 --out results/tune/rl"
@@ -125,7 +124,7 @@ def settings_of(options: argparse.Namespace) -> "TuningSettings":
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command and return its exit code."""
-    from experiments.jobs.console import Display, check_resume, need
+    from experiments.jobs.console import TuningDisplay, check_resume, need
 
     if options.method in PACKAGES:
         need(f"tune --method {options.method}", *PACKAGES[options.method])
@@ -135,32 +134,18 @@ def run(options: argparse.Namespace, console: Console) -> int:
     check_resume(folder, "tuning", resume=options.resume)
     settings = settings_of(options)
 
-    class TuningDisplay(Display):
-        """A line for every tenth of the budget."""
-
-        printed = 0
-
-        def line(self, line: "Line") -> None:
-            self.show(line["solves"], f"{settings.method} score {line['score']:.3f}")
-            if (tenth := 10 * line["solves"] // settings.solves) > self.printed:
-                self.printed = tenth
-                self.say(
-                    f"{line['solves']:>11,} solves {line['seconds']:5.0f} s  score of what was "
-                    f"tried {line['score']:.3f}"
-                )
-
-    display = TuningDisplay(console, settings.solves)
+    display = TuningDisplay(console, settings.method, settings.solves)
     with resumable(options, console, "the same command with --resume"), display.progress:
         lines = tune(settings, folder, display, command=command_line(settings, options))
     if not lines:
         console.print(f"the default weights: {folder / WEIGHTS}", markup=False, soft_wrap=True)
         return 0
     last = lines[-1]
-    console.print(
+    console.out(
         f"{last['solves']:,} solves in {last['seconds']:.0f} s; weights: {folder / WEIGHTS} "
         f"(lpv-track benchmark --agents lpv-nmpc-tuned --agent-set weights={folder / WEIGHTS})",
-        markup=False, highlight=False, soft_wrap=True,
-    )  # fmt: skip
+        highlight=False,
+    )
     return 0
 
 

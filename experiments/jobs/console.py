@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from experiments.jobs.job import Listener, stored_settings
+from experiments.jobs.job import Line, Listener, stored_settings
 from experiments.run.benchmark import progress_bar
 
 
@@ -32,6 +32,45 @@ class Display(Listener):
     def say(self, text: str) -> None:
         """Print a line."""
         self._console.print(text, markup=False, highlight=False)
+
+
+class TrainingDisplay(Display):
+    """Prints a line for every segment."""
+
+    def __init__(self, console: Console, algorithm: str, steps: int) -> None:
+        super().__init__(console, steps)
+        self._algorithm = algorithm
+
+    def tick(self, done: int, words: str) -> None:
+        """Show the steps so far."""
+        self.show(done, f"{self._algorithm} {words}")
+
+    def line(self, line: Line) -> None:
+        """Print the validation after a segment."""
+        validation = line["validation"]
+        self.say(
+            f"{line['steps']:>11,} steps {line['seconds']:5.0f} s  "
+            f"loss {validation['loss']:7.4f}  finished {validation['finished']:4.0%}  "
+            f"ALE {validation['mean_ale']:.4f} m{'  best' if line['best'] else ''}"
+        )
+
+
+class TuningDisplay(Display):
+    """Prints a line for every tenth of the budget."""
+
+    def __init__(self, console: Console, method: str, solves: int) -> None:
+        super().__init__(console, solves)
+        self._method, self._solves, self._printed = method, solves, 0
+
+    def line(self, line: Line) -> None:
+        """Show the score of a step, and print it once in a tenth."""
+        self.show(line["solves"], f"{self._method} score {line['score']:.3f}")
+        if (tenth := 10 * line["solves"] // self._solves) > self._printed:
+            self._printed = tenth
+            self.say(
+                f"{line['solves']:>11,} solves {line['seconds']:5.0f} s  score of what was "
+                f"tried {line['score']:.3f}"
+            )
 
 
 def check_resume(folder: Path, kind: str, *, resume: bool) -> bool:

@@ -18,9 +18,9 @@ from experiments.report.page import (
     paragraph,
 )
 from experiments.report.svg_charts import BOTTOM, TOP, Chart, Scale, decades
-from experiments.run import published, tables
-from experiments.run.agent_tables import BAND_NOTE, Line, band_lines, band_ranges
-from experiments.run.metrics import BANDS
+from experiments.run import tables
+from experiments.run.console_tables import BAND_NOTE, Line, band_lines, band_ranges
+from experiments.run.metrics import BANDS, published_row
 from experiments.run.tables import EFFORT, FURTHER, TRACKING, Column, Estimate, Result, Row, Setting
 
 ERRORS = (
@@ -101,7 +101,7 @@ def by_agent(
         references = {
             kind: reference[key]
             for kind in shown
-            if (reference := published.row(name, kind)) is not None
+            if (reference := published_row(name, kind)) is not None
         }
         values = [end for row in group for end in _ends(row.values[key])]
         chart = Chart(

@@ -9,7 +9,7 @@ import numpy as np
 from experiments.report.drives import LEAD, family_of, main_family, per_setting
 from experiments.report.page import Document, html_table, joined, paragraph
 from experiments.run import tables
-from experiments.run.agent_tables import (
+from experiments.run.console_tables import (
     KEY_FIGURES,
     against_published,
     key_lines,

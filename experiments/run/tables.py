@@ -1,4 +1,4 @@
-"""Rows of the paper's table from results; `console_tables` and `html_tables` draw them.
+"""Rows of the paper's table from results; `console_tables` and the report draw them.
 
 Cases are grouped by setting (vehicle, speed mode, conditions and so on) and trajectory. A group's
 first row is the published one (kumar2025lpv), then comes one row per agent; several seeds become a
@@ -18,10 +18,9 @@ from scipy.stats import t as student
 
 import agents
 import trajectories
-from experiments.run import published
 from experiments.run.case import Case
 from experiments.run.learning_cost import words
-from experiments.run.metrics import KEPT
+from experiments.run.metrics import KEPT, PAPER_COLUMNS, published_row
 from experiments.run.statistics import CONFIDENCE
 
 Result = Mapping[str, Any]
@@ -176,10 +175,7 @@ class Column:
         return f"{mean}{separator}±{self.factor * found.half_width:.{decimals}f}"
 
 
-TRACKING = tuple(
-    Column(key, published.LABELS[key].rsplit(" ", 1)[0], published.LABELS[key].rsplit(" ", 1)[1], 3)
-    for key in published.COLUMNS
-)
+TRACKING = tuple(Column(key, heading, unit, 3) for key, (heading, unit) in PAPER_COLUMNS.items())
 """The paper's columns: in metres, and for the heading in radians."""
 EFFORT = (
     Column("median", "predict median", "ms", 2, 1e3, "solver"),
@@ -378,7 +374,7 @@ def build_rows(cases: Iterable[Result]) -> list[Row]:
     rows = []
     for (setting, trajectory), by_label in groups.items():
         conditions = next(iter(by_label.values()))[0].get("conditions", "simulation")
-        reference = published.row(trajectory, conditions)
+        reference = published_row(trajectory, conditions)
         if reference is not None:
             values = {key: Estimate(value) for key, value in reference.items()}
             rows.append(Row(setting, trajectory, PUBLISHED_LABEL, values, published=True))

@@ -200,7 +200,7 @@ def training(section: Section, effort: Effort, tick: Tick) -> None:
         return
     from stable_baselines3.common.logger import Logger
 
-    from experiments.jobs.paths import load_paths
+    from experiments.jobs.job import load_paths
     from experiments.training.loop import make_trainer, path_names
     from experiments.training.settings import FAST, usual
 

@@ -15,12 +15,16 @@ from stable_baselines3.common.logger import Logger, configure
 from agents.learned.policy import read as read_policy
 from agents.learned.policy import write as write_policy
 from experiments.jobs import checkpoint
-from experiments.jobs.job import Job, Line, Listener, claimed, run_job
-from experiments.jobs.paths import (
+from experiments.jobs.job import (
     VALIDATION_EPISODES,
     VALIDATION_PATHS,
+    Job,
+    Line,
+    Listener,
+    claimed,
     load_paths,
     random_names,
+    run_job,
     training_names,
 )
 from experiments.run.case import Case, run_case

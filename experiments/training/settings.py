@@ -9,8 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from agents.learned.policy import ACTIVATIONS, ORIGINS
-from experiments.jobs.job import plain_values
-from experiments.jobs.paths import check_paths
+from experiments.jobs.job import check_paths, plain_values
 from experiments.training import ALGORITHMS
 from lpv_track_env import conditions, vehicle
 from lpv_track_env.reward import RewardWeights

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import agents
 from agents.learned.learner import LearnerVecEnv, usual_scaling
 from agents.learned.policy import Policy
-from experiments.jobs.paths import episode_seed
+from experiments.jobs.job import episode_seed
 from experiments.training.settings import TrainingSettings
 from lpv_track_env import vehicle
 from lpv_track_env.vector_env import PathTrackingVectorEnv

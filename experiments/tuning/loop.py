@@ -5,8 +5,15 @@ from typing import Any
 
 from agents.weight_tuning.policy import write as write_policy
 from agents.weights import TrackingWeights, WeightSchedule
-from experiments.jobs.job import Line, Listener, claimed, run_job, write_settings
-from experiments.jobs.paths import load_paths, training_names
+from experiments.jobs.job import (
+    Line,
+    Listener,
+    claimed,
+    load_paths,
+    run_job,
+    training_names,
+    write_settings,
+)
 from experiments.run.provenance import provenance
 from experiments.tuning.settings import PPO_METHODS, TuningSettings
 from experiments.tuning.tuner import Result, Tuner

@@ -19,7 +19,7 @@ from agents.weight_tuning.features import subset_mask
 from agents.weight_tuning.learner import WeightLearnerVecEnv
 from agents.weight_tuning.policy import WeightPolicy
 from experiments.jobs import checkpoint
-from experiments.jobs.paths import episode_seed
+from experiments.jobs.job import episode_seed
 from experiments.tuning.settings import TuningSettings
 from experiments.tuning.tuner import Tuner, choice_of, threads
 from lpv_track_env import vehicle

@@ -7,8 +7,7 @@ from typing import Any
 
 from agents.weight_tuning.choice import DIRECTIONS
 from agents.weight_tuning.features import SUBSETS
-from experiments.jobs.job import plain_values
-from experiments.jobs.paths import check_paths
+from experiments.jobs.job import check_paths, plain_values
 from experiments.training.settings import LEAST, MOST
 from experiments.tuning import METHODS
 from lpv_track_env import conditions, vehicle
@@ -47,8 +46,8 @@ HYPERPARAMETERS: dict[str, dict[str, Any]] = {
 drives in a step; `segment` the solves between checkpoints.
 
 Of `paired`: `deviation` of an action's offsets, each held for `hold` windows; `curvature` and
-`response` of the prior and `least_curvature` of the cost, see `quadratic`; `half_life` of a pair's
-influence, in budgets; `step`, the share of the way to the best policy of a fit.
+`response` of the prior and `least_curvature` of the cost, see `paired.PairedQuadratic`; `half_life`
+of a pair's influence, in budgets; `step`, the share of the way to the best policy of a fit.
 """
 
 

@@ -16,8 +16,7 @@ from agents.weight_tuning.closed_loop import ClosedLoop
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import scores_of
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
-from experiments.jobs.job import PROGRESS, Job, Line, read_lines
-from experiments.jobs.paths import episode_seed
+from experiments.jobs.job import PROGRESS, Job, Line, episode_seed, read_lines
 from experiments.tuning.settings import TuningSettings
 from lpv_track_env import vehicle
 from lpv_track_env.vector_env import PathTrackingVectorEnv

@@ -10,7 +10,8 @@ from experiments.report import sideslip, svg_charts
 from experiments.report.build import ERRATA, write_report
 from experiments.report.drives import reference_path, usable
 from experiments.report.page import line_styles
-from experiments.run import published, tables
+from experiments.run import tables
+from experiments.run.metrics import published_row
 from experiments.run.store import ResultStore
 from lpv_track_env import vehicle
 from tests.helpers.made_results import (
@@ -43,7 +44,7 @@ def test_the_published_row_comes_first_and_seeds_are_one_row():
     assert [row.label for row in rows] == ["published", "stanley", "pid"]
     first, stanley, pid = rows
     assert first.published
-    assert {key: value.mean for key, value in first.values.items()} == published.row("T2")
+    assert {key: value.mean for key, value in first.values.items()} == published_row("T2")
     assert stanley.runs == 3
     assert stanley.values["ale"].mean == pytest.approx(0.2)
     assert stanley.values["ale"].half_width == pytest.approx(4.302652730 * 0.1 / math.sqrt(3.0))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from experiments.run.agent_tables import band_lines, band_ranges
+from experiments.run.console_tables import band_lines, band_ranges
 from tests.helpers.made_results import (
     HOSTILE,
     Outline,

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import agents
-from experiments.jobs.paths import TRAINING_PATHS, VALIDATION_PATHS
+from experiments.jobs.job import TRAINING_PATHS, VALIDATION_PATHS
 from experiments.run.case import Case
 from experiments.run.suites import (
     BESIDE,

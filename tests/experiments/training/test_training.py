@@ -18,14 +18,16 @@ from stable_baselines3.common.logger import Logger
 from agents.learned.policy import read as read_policy
 from experiments import cli
 from experiments.jobs import checkpoint
-from experiments.jobs.job import Listener, difference, locked
-from experiments.jobs.paths import (
+from experiments.jobs.job import (
     TRAINING_EPISODES,
     TRAINING_PATHS,
     VALIDATION_EPISODES,
     VALIDATION_PATHS,
+    Listener,
+    difference,
     episode_seed,
     load_paths,
+    locked,
 )
 from experiments.run.case import run_case
 from experiments.run.suites import HELD_OUT, SIX

@@ -27,7 +27,7 @@ from agents.weight_tuning.choice import SLEW
 from agents.weight_tuning.policy import WeightPolicy, load
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments import cli
-from experiments.jobs.paths import load_paths
+from experiments.jobs.job import load_paths
 from experiments.run.provenance import revision, versions
 from experiments.tuning import METHODS
 from experiments.tuning.loop import path_names

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 import trajectories
 from agents.weight_tuning.features import names
 from agents.weight_tuning.score import USUAL, USUAL_WINDOWS, rms_so_far
-from experiments.tuning.paired import BIAS, PairedLearning
-from experiments.tuning.quadratic import PairedQuadratic, Prior
+from experiments.tuning.paired import BIAS, PairedLearning, PairedQuadratic, Prior
 from experiments.tuning.settings import usual
 
 Array = NDArray[Any]

@@ -12,7 +12,7 @@ pytest.importorskip("cma")
 
 import trajectories
 from agents.weights import TrackingWeights
-from experiments.jobs.paths import load_paths
+from experiments.jobs.job import load_paths
 from experiments.tuning.loop import path_names
 from experiments.tuning.search import CmaSearch, GradientSearch, PathClassSearch, Search
 from experiments.tuning.settings import HYPERPARAMETERS, usual

@@ -1,4 +1,4 @@
-"""`lpv-track switching`, tiny: what is drawn, who is followed, what is told."""
+"""`lpv-track switching`, tiny: draws of weights, branches that are followed, results."""
 
 import json
 import math
@@ -16,8 +16,9 @@ from agents.weight_tuning.closed_loop import ClosedLoop
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
 from experiments import cli
 from experiments.commands.switching import base_of, widest_kept
-from experiments.robustness import switching
-from experiments.robustness.switching import (
+from experiments.run.statistics import rate_bound
+from experiments.study import weight_switching
+from experiments.study.weight_switching import (
     ADVERSARY,
     CONTROL,
     RANDOM,
@@ -32,7 +33,6 @@ from experiments.robustness.switching import (
     summary,
     weights_before_loss,
 )
-from experiments.run.statistics import rate_bound
 from lpv_track_env import kernels as k
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import CurvatureBands
@@ -124,7 +124,7 @@ def test_an_adversary_with_one_draw_is_chance() -> None:
 
 def test_batches_and_threads_change_nothing_but_the_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = outcome_of(Arm(CONTROL))
-    monkeypatch.setattr(switching, "BATCH", 2)
+    monkeypatch.setattr(weight_switching, "BATCH", 2)
     assert_same(outcome_of(Arm(CONTROL)), whole)
 
 
@@ -243,7 +243,7 @@ def test_switching(
         small = Setup(**{**vars(setup), "paths": 2, "time_limit": 1.0})
         return drive_arm(small, arm, tick)
 
-    monkeypatch.setattr(switching, "drive_arm", counted)
+    monkeypatch.setattr(weight_switching, "drive_arm", counted)
     all_driven: list[str] = []
     for code in (cli.EXIT_INTERRUPTED, cli.EXIT_INTERRUPTED, 0, 0):
         driven.clear()

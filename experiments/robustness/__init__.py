@@ -1,1 +1,0 @@
-"""Robustness of closed loops against switching weights."""
