@@ -174,14 +174,14 @@ def agent_notes(name: str, info: dict[str, Any]) -> dict[str, str]:
 
     They do not depend on the speed of the computer, so that equal drives give equal frames.
     """
-    notes, told = {"agent": name}, info.get("agent", {})
-    if "status" in told:
-        count = told["iterations"]
-        notes["solver"] = f"{told['status']}, {count} iteration{'' if count == 1 else 's'}"
+    notes, solve = {"agent": name}, info.get("agent", {})
+    if "status" in solve:
+        count = solve["iterations"]
+        notes["solver"] = f"{solve['status']}, {count} iteration{'' if count == 1 else 's'}"
         # A row in any case, so that the card keeps its size.
-        notes["fallback"] = told.get("fallback") or "none"
-    if told.get("weights") is not None:
-        notes |= in_words(told["weights"])
+        notes["fallback"] = solve.get("fallback") or "none"
+    if solve.get("weights") is not None:
+        notes |= in_words(solve["weights"])
     if info.get("stopping"):
         notes["vehicle"] = "brakes by itself"
     return notes

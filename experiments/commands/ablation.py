@@ -9,7 +9,14 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from experiments.commands.options import add_out, add_seeds, add_workers, resumable, seeds_of
+from experiments.commands.options import (
+    add_out,
+    add_seeds,
+    add_trajectories,
+    add_workers,
+    resumable,
+    seeds_of,
+)
 
 EXAMPLE = "lpv-track ablation --trajectories T2 T5 --seeds 10 --out results/ablation"
 
@@ -48,7 +55,7 @@ ALL_BUT: dict[str, dict[str, Any]] = {
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("--agent", default="lpv-nmpc", metavar="NAME")
-    parser.add_argument("--trajectories", nargs="+", default=["T2", "T5"], metavar="NAME")
+    add_trajectories(parser, ["T2", "T5"])
     add_seeds(parser, 10)
     add_out(parser, "results/ablation")
     add_workers(parser)

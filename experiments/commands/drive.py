@@ -50,8 +50,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="how many times faster than real time the video runs (default 1)",
     )  # fmt: skip
     parser.add_argument(
-        "--colour", default="speed", metavar="WHAT",
-        help="of the path: speed (default) or curvature",
+        "--colour", default="speed", metavar="NAME",
+        help="quantity that colours the path: speed (default) or curvature",
     )  # fmt: skip
 
 

@@ -110,7 +110,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         )
     for spec in specs:
         TrafficCase(**spec).check()
-    # What makes no environment is refused before anything is driven.
+    # Refuse settings that the environment does not accept before anything is driven.
     TrafficCase(**specs[0]).make_env().close()
     with resumable(options, console):
         store = run_benchmark(
@@ -125,7 +125,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def table(names: Iterable[str], results: Sequence[Mapping[str, Any]]) -> Table:
-    """Return a table with a row per agent: how its drives ended, and how it drove."""
+    """Return a table with a row per agent: ends of its drives, errors, gaps, speed, times."""
     import numpy as np
 
     from experiments.run.statistics import rate_interval

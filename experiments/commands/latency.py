@@ -21,7 +21,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from experiments.commands.options import add_out, add_seeds, add_workers, resumable, seeds_of
+from experiments.commands.options import (
+    add_out,
+    add_seeds,
+    add_trajectories,
+    add_workers,
+    resumable,
+    seeds_of,
+)
 
 EXAMPLE = "lpv-track latency --trajectories T2 T4 --seeds 10 --out results/latency"
 
@@ -47,7 +54,7 @@ COLUMNS = ("sequential", SLOWER_CLOCK, "triggered", "free-running")
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("--trajectories", nargs="+", default=["T2", "T4"], metavar="NAME")
+    add_trajectories(parser, ["T2", "T4"])
     add_seeds(parser, 10)
     parser.add_argument(
         "--times", type=Path, metavar="FILE",

@@ -1,4 +1,4 @@
-"""`lpv-track switching`: whether switching the NMPC's weights loses vehicles."""
+"""`lpv-track switching`: vehicles lost when the NMPC's weights are switched."""
 
 import argparse
 import dataclasses
@@ -39,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--candidates", type=int, default=4, metavar="K",
-        help="draws in every window of which the adversary takes the worst (default 4)",
+        help="draws in every window; the adversary takes the worst of them (default 4)",
     )  # fmt: skip
     parser.add_argument("--conditions", default="realtime", metavar="NAME")
     add_vehicle(parser)
@@ -94,10 +94,7 @@ def base_of(file: Path | None) -> "TrackingWeights":
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command and return its exit code.
-
-    It drives every arm, prints the table and writes `switching.json`; arms in it are kept.
-    """
+    """Drive every arm, print the table and write `switching.json`; arms in it are kept."""
     from agents.weights import HIGHEST, LOWEST
     from experiments.run.benchmark import progress_bar
     from experiments.run.provenance import provenance

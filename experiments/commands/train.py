@@ -12,7 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from experiments.commands.options import add_settings, parse_settings, resumable
+from experiments.commands.options import (
+    add_settings,
+    add_trajectories,
+    parse_settings,
+    resumable,
+)
 from experiments.training import ALGORITHMS
 
 if TYPE_CHECKING:
@@ -64,11 +69,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_settings(
         parser, "--conditions-set", "fields to change in each of them, e.g. friction=[0.4,1.0]"
     )
-    parser.add_argument(
-        "--trajectories",
-        nargs="+",
-        metavar="NAME",
-        help="own paths in place of random ones; not those of the suites paper and learned",
+    add_trajectories(
+        parser, None, "own paths in place of random ones; not those of the suites paper and learned"
     )
     parser.add_argument("--paths", type=int, metavar="N", help="random paths (default 48)")
     parser.add_argument(

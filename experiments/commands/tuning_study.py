@@ -28,7 +28,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--drives", type=int, default=8, metavar="N",
-        help="drives a path that judge a training (default 8)",
+        help="drives on each path in the evaluation of a training (default 8)",
     )  # fmt: skip
     parser.add_argument(
         "--tracks", type=Path, metavar="DIR",
@@ -37,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2)")
     parser.add_argument(
         "--quick", action="store_true",
-        help="2 trainings of 60,000 solves, 2 drives a path, small oracles: what it looks like",
+        help="2 trainings of 60,000 solves, 2 drives a path, small oracles: a preview",
     )  # fmt: skip
 
 

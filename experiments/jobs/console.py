@@ -68,8 +68,8 @@ class TuningDisplay(Display):
         if (tenth := 10 * line["solves"] // self._solves) > self._printed:
             self._printed = tenth
             self.say(
-                f"{line['solves']:>11,} solves {line['seconds']:5.0f} s  score of what was "
-                f"tried {line['score']:.3f}"
+                f"{line['solves']:>11,} solves {line['seconds']:5.0f} s  score of the "
+                f"candidates {line['score']:.3f}"
             )
 
 

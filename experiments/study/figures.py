@@ -45,7 +45,7 @@ def learning_curves(study: Study, styles: Styles) -> list[Panel]:
     chart = Chart(
         decades([solves for solves, _ in curves.values()], 1.0),
         around([scores for _, scores in curves.values()]),
-        x_label="NMPC solves", y_label="score of what was tried", height=HEIGHT,
+        x_label="NMPC solves", y_label="score of the candidates", height=HEIGHT,
     )  # fmt: skip
     for label, (solves, scores) in curves.items():
         style = styles[label]

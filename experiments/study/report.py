@@ -1,4 +1,4 @@
-"""Report of the tuning study: one page, with everything needed to check its figures."""
+"""Report of the tuning study: one page with tables, figures and the manifest."""
 
 import html
 import json
@@ -24,8 +24,8 @@ from trajectories.fileio import write_atomically
 
 FORMULA = (
     "score = rms lateral error / 0.05 m + rms heading error / 0.1 rad + rms speed error / 0.5 m/s "
-    "(tracking) + rms steering rate / 0.2 rad/s + rms jerk / 4 m/s³ (comfort); of the truth, mean "
-    "over drives, lower is better; a drive that fails scores 25"
+    "(tracking) + rms steering rate / 0.2 rad/s + rms jerk / 4 m/s³ (comfort); of the true state, "
+    "mean over drives, lower is better; a drive that fails scores 25"
 )
 
 
@@ -61,7 +61,7 @@ def write_report(
         undisturbed = [tables.rung_result(study, name, label) for label in alone]
         page.section(
             f"Curvature alone: {name}",
-            paragraph("Tuned and judged without disturbances: nothing differs but the path.")
+            paragraph("Tuned and evaluated without disturbances: drives differ in the path alone.")
             + _ladder(page, name, undisturbed, None),
         )
     headings, lines = tables.sets_lines(study, study.labels)
@@ -155,11 +155,11 @@ def _figures(
     tried = {label: styles[label] for label in labels}
     parts = []
     if curves := figures.learning_curves(study, tried):
-        parts.append(page.figure("Scores of what was tried.", curves, legend(styles, labels), True))
+        parts.append(page.figure("Scores of the candidates.", curves, legend(styles, labels), True))
     if greedy is not None:
         parts.append(
             page.figure(
-                "Regret against solves. Straight lines: what was not trained.",
+                "Regret against solves. Straight lines: rungs without training.",
                 figures.regret(rows, greedy, styles),
                 legend(styles, styles),
                 True,

@@ -101,7 +101,7 @@ def rung_lines(rows: Sequence[RungResult], headroom: float | None) -> Lines:
 
 
 HEADROOM_HEADINGS = (
-    "who knows", "score in hindsight", "gain", "score by foresight", "gain by foresight",
+    "known to the choice", "score in hindsight", "gain", "score by foresight", "gain by foresight",
 )  # fmt: skip
 
 

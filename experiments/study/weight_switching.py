@@ -1,4 +1,4 @@
-"""How often vehicles are lost when weights are switched at random or by an adversary."""
+"""Drives whose weights are switched at random or by an adversary, and the vehicles lost."""
 
 import math
 from collections import Counter
@@ -15,6 +15,7 @@ from agents.weight_tuning.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.features import TUNED
 from agents.weight_tuning.score import failed
 from agents.weights import HIGHEST, LOWEST, TrackingWeights
+from experiments.jobs.job import random_names
 from experiments.run.statistics import rate_bound
 from lpv_track_env import kernels as k
 from lpv_track_env.vector_env import PathTrackingVectorEnv
@@ -121,7 +122,7 @@ class Setup:
     @property
     def trajectories(self) -> list[str]:
         """Names of the paths."""
-        return [f"random-{'fast-' * (seed % 2)}{seed}" for seed in range(self.paths)]
+        return random_names(0, self.paths)
 
     @property
     def windows(self) -> int:

@@ -95,13 +95,13 @@ def lines_until(solves: int, folder: Path) -> list[Line]:
     Raises
     ------
     ValueError
-        In one line, if they cannot be read, or are not those of the state.
+        In one line, if they cannot be read or do not fit the state.
     """
     try:
         lines = read_lines(folder)
         kept = [line for line in lines if line["solves"] <= solves]
         if not kept or kept[-1]["solves"] != solves:
-            raise ValueError(f"it does not tell of the step that ended at {solves:,} solves")
+            raise ValueError(f"no line is of the step that ended at {solves:,} solves")
     except (OSError, KeyError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(
