@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self
+from typing import Self
 
 import numpy as np
 import pygame
@@ -117,9 +117,10 @@ class Video(Closing):
         if size != self._size:
             raise ValueError(f"frames must be of one size: {self._size}, then {size}")
         pixels = np.ascontiguousarray(frame)
+        assert encoder.stdin is not None
         try:
             for _ in range(times):
-                _input(encoder).write(pixels.data)
+                encoder.stdin.write(pixels.data)
                 self.count += 1
         except OSError:
             raise OSError(f"{self.file}: {self._finish()}") from None
@@ -161,11 +162,6 @@ class Video(Closing):
             message = self._encoder.stderr.read() if self._encoder.stderr else b""
             self._encoder.wait()
         return " ".join(message.decode(errors="replace").split()) or "the encoder gave up"
-
-
-def _input(encoder: "subprocess.Popen[bytes]") -> IO[bytes]:
-    assert encoder.stdin is not None
-    return encoder.stdin
 
 
 class Sink(Closing, ABC):

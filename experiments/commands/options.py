@@ -19,6 +19,19 @@ def add_out(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument("--out", type=Path, default=Path(default), metavar="DIR")
 
 
+def add_job(parser: argparse.ArgumentParser, folder: str) -> None:
+    """Add the options that trainings and tunings share; `folder` is the default of `--out`."""
+    parser.add_argument("--out", type=Path, metavar="DIR", help=f"default: {folder}")
+    parser.add_argument("--resume", action="store_true", help="go on from the last state in DIR")
+    parser.add_argument("--seed", type=int, default=0, help="0 to 999 (default 0)")
+    parser.add_argument("--vehicle", metavar="NAME", help="preset or .json (default m2-minibus)")
+    parser.add_argument("--control-period", type=float, metavar="S", help="s (default 0.05)")
+    parser.add_argument("--preview-steps", type=int, metavar="K", help="default 20")
+    parser.add_argument(
+        "--preview-period", type=float, metavar="S", help="s (default: the control period)"
+    )
+
+
 def add_workers(parser: argparse.ArgumentParser) -> None:
     """Add `--workers N`, all cores by default."""
     parser.add_argument(

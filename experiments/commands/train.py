@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from experiments.commands.options import (
+    add_job,
     add_settings,
     add_trajectories,
     parse_settings,
@@ -46,8 +47,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "algorithm", choices=ALGORITHMS,
         help="ppo, sac, td3; bc: cloning of lpv-nmpc with DAgger; residual: ppo on top of lpv-nmpc",
     )  # fmt: skip
-    parser.add_argument("--out", type=Path, metavar="DIR", help="default: results/train/ALGORITHM")
-    parser.add_argument("--seed", type=int, default=0, help="0 to 999 (default 0)")
+    add_job(parser, "results/train/ALGORITHM")
     parser.add_argument(
         "--steps", type=float, metavar="N", help="budget in environment steps, e.g. 2e7"
     )
@@ -55,13 +55,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--hours", type=float, metavar="H",
         help="budget in hours: as many steps as a trial says will fit, or --steps cut short",
     )  # fmt: skip
-    parser.add_argument("--resume", action="store_true", help="go on from DIR's last checkpoint")
     parser.add_argument(
         "--fast",
         action="store_true",
         help="ppo: simulation only, half the updates, less than a minute",
     )
-    parser.add_argument("--vehicle", metavar="NAME", help="preset or .json (default m2-minibus)")
     parser.add_argument(
         "--conditions", nargs="+", metavar="NAME",
         help="kinds that share the environments (default: simulation realtime)",
@@ -88,11 +86,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="POLICY",
         help="policy file to start from, e.g. of bc; ppo fits its value function alone in the "
         "first segment",
-    )
-    parser.add_argument("--control-period", type=float, metavar="S", help="s (default 0.05)")
-    parser.add_argument("--preview-steps", type=int, metavar="K", help="default 20")
-    parser.add_argument(
-        "--preview-period", type=float, metavar="S", help="s (default: the control period)"
     )
     add_settings(
         parser, "--set",

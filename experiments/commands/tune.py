@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from experiments.commands.options import add_conditions, add_settings, parse_settings, resumable
+from experiments.commands.options import (
+    add_conditions,
+    add_job,
+    add_settings,
+    parse_settings,
+    resumable,
+)
 from experiments.tuning import METHODS
 
 if TYPE_CHECKING:
@@ -42,14 +48,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "multiplies weights while driving; paired: a linear policy does, learned from drives "
         "alike but for their weights",
     )  # fmt: skip
-    parser.add_argument("--out", type=Path, metavar="DIR", help="default: results/tune/METHOD")
+    add_job(parser, "results/tune/METHOD")
     parser.add_argument(
         "--solves", type=float, default=300_000, metavar="N",
         help="budget in solves of the NMPC, e.g. 3e6 (default 3e5); never exceeded",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="0 to 999 (default 0)")
-    parser.add_argument("--resume", action="store_true", help="go on with what DIR holds")
-    parser.add_argument("--vehicle", metavar="NAME", help="preset or .json (default m2-minibus)")
     parser.add_argument(
         "--trajectories", "--paths", nargs="+", metavar="PATH", dest="trajectories",
         help="own paths, names or files, in place of random ones; not those of the evaluation",
@@ -68,11 +71,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--time-limit", type=float, metavar="S", help="of a drive (default 10 s, PPO 20 s)"
-    )
-    parser.add_argument("--control-period", type=float, metavar="S", help="s (default 0.05)")
-    parser.add_argument("--preview-steps", type=int, metavar="K", help="default 20")
-    parser.add_argument(
-        "--preview-period", type=float, metavar="S", help="s (default: the control period)"
     )
     parser.add_argument(
         "--directions", metavar="NAME",

@@ -63,6 +63,15 @@ class EvaluationSet:
             path.name if isinstance(path, ReferencePath) else path for path in self.trajectories
         )
 
+    def environments(
+        self, path: str | ReferencePath, count: int | None = None
+    ) -> PathTrackingVectorEnv:
+        """Make the environments of a path's drives: one for each seed, or `count` of them."""
+        return PathTrackingVectorEnv(
+            self.seeds if count is None else count, path, self.vehicle, conditions=self.conditions,
+            autoreset_mode="Disabled", **self.env_settings,
+        )  # fmt: skip
+
 
 def usual_sets(seeds: int) -> list[EvaluationSet]:
     """Return the sets of the study: held-out random paths, the paper's six, raw waypoints.
@@ -104,13 +113,7 @@ class Evaluator:
     """Environments of an evaluation set, made once to evaluate many weights."""
 
     def __init__(self, given: EvaluationSet) -> None:
-        settings: dict[str, Any] = {
-            "conditions": given.conditions, "autoreset_mode": "Disabled", **given.env_settings,
-        }  # fmt: skip
-        self.drives = [
-            PathTrackingVectorEnv(given.seeds, path, given.vehicle, **settings)
-            for path in given.trajectories
-        ]
+        self.drives = [given.environments(path) for path in given.trajectories]
 
     def evaluate(self, result: Result, *, by_path: bool = False) -> dict[str, Array]:
         """Drive the set; return the figures of every drive, (paths, seeds) each, by `FIGURES`.

@@ -17,7 +17,6 @@ from experiments.study.study import Study
 from experiments.study.tables import RungResult
 from experiments.tuning.loop import WEIGHTS
 from experiments.tuning.tuner import Result
-from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import CurvatureBands
 
 Array = NDArray[Any]
@@ -105,13 +104,9 @@ def _offset(k: int, count: int) -> float:
 
 def weights_in_use(result: Result, given: EvaluationSet) -> tuple[Array, Array]:
     """Return the weights (m, 10) and bands (m,) of the windows of some drives."""
-    settings: dict[str, Any] = {"autoreset_mode": "Disabled", **given.env_settings}
     used, bands = [], []
     for path in given.trajectories[:6]:
-        envs = PathTrackingVectorEnv(
-            given.seeds, path, given.vehicle, conditions=given.conditions, **settings
-        )
-        loop = loop_with(result, envs)
+        loop = loop_with(result, given.environments(path))
         loop.reset(seed=0)
         for _ in range(WINDOWS):
             loop.drive(8)

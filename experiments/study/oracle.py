@@ -120,10 +120,7 @@ def loop_of(envs: PathTrackingVectorEnv) -> ClosedLoop:
 def scores_of_pool(given: EvaluationSet, pool: Array) -> Iterator[tuple[Array, Array]]:
     """Yield scores (sets, seeds) and known conditions (seeds, 3) of each path of a set."""
     for path in given.trajectories:
-        envs = PathTrackingVectorEnv(
-            given.seeds, path, given.vehicle, conditions=given.conditions,
-            autoreset_mode="Disabled", **given.env_settings,
-        )  # fmt: skip
+        envs = given.environments(path)
         loop = loop_of(envs)
         scores = np.empty((len(pool), given.seeds))
         for i, weights in enumerate(pool):
@@ -224,10 +221,7 @@ def greedy(
     count = len(pool)
     for path in given.trajectories:
         n = given.seeds
-        envs = PathTrackingVectorEnv(
-            n * (1 + count), path, given.vehicle, conditions=given.conditions,
-            autoreset_mode="Disabled", **given.env_settings,
-        )  # fmt: skip
+        envs = given.environments(path, n * (1 + count))
         loop = loop_of(envs)
         loop.reset(seed=[*range(n), *(seed for seed in range(n) for _ in range(count))])
         main, branches = np.arange(n), n + np.arange(n * count)

@@ -35,9 +35,6 @@ class Tuner(Job):
 
     settings: TuningSettings
 
-    def __init__(self, settings: TuningSettings) -> None:
-        super().__init__(settings)
-
     @property
     @abstractmethod
     def solves(self) -> int:
