@@ -6,23 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from experiments.commands.options import (
-    add_agent_settings,
-    add_agents,
-    add_conditions,
-    add_out,
-    add_seeds,
-    add_settings,
-    add_speed_modes,
-    add_trajectories,
-    add_vehicles,
-    add_workers,
-    agent_settings,
-    conditions_of,
-    parse_settings,
-    resumable,
-    seeds_of,
-)
+from experiments.commands import options as shared
 
 if TYPE_CHECKING:
     from experiments.run.store import ResultStore
@@ -37,25 +21,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default="paper",
         help="paper (default), quick, realtime, learned, plants, converged, sideslip or frozen",
     )
-    add_agents(parser, "default: all; your own: file.py:Class, policy.json")
-    add_trajectories(parser, None, "instead of a suite's: names or files")
-    add_vehicles(parser, None, "presets or .json files")
-    add_speed_modes(parser, None)
-    add_conditions(
+    shared.add_agents(parser, "default: all; your own: file.py:Class, policy.json")
+    shared.add_trajectories(parser, None, "instead of a suite's: names or files")
+    shared.add_vehicles(parser, None, "presets or .json files")
+    shared.add_speed_modes(parser, None)
+    shared.add_conditions(
         parser,
         None,
         "simulation (default), realtime or ideal",
         "fields to change, e.g. gnss_noise=0.3 computing_delay=[0.01,0.05]",
     )
-    add_seeds(parser, 1, "seeds 0..N-1 (default 1)")
+    shared.add_seeds(parser, 1, "seeds 0..N-1 (default 1)")
     parser.add_argument("--control-period", type=float, metavar="S", help="s (default 0.05)")
-    add_settings(parser, "--env", "environment settings, e.g. initial_error_range=[0.3,0.1,0.5]")
-    add_agent_settings(parser)
-    add_settings(
+    shared.add_settings(
+        parser, "--env", "environment settings, e.g. initial_error_range=[0.3,0.1,0.5]"
+    )
+    shared.add_agent_settings(parser)
+    shared.add_settings(
         parser, "--vehicle-set", "vehicle fields to change, e.g. max_lateral_velocity_ratio=0.5"
     )
-    add_out(parser, "results/benchmark")
-    add_workers(parser)
+    shared.add_out(parser, "results/benchmark")
+    shared.add_workers(parser)
     parser.add_argument(
         "--resume", action="store_true", help="keep the cases that DIR holds already"
     )
@@ -67,7 +53,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from experiments.run.benchmark import distinct, run_benchmark, selected
     from trajectories.naming import choose
 
-    seeds = seeds_of(options)
+    seeds = shared.seeds_of(options)
     names = options.agents or suites.default_agents()
     if options.trajectories or options.vehicles or options.speed_modes:
         specs = suites.grid(
@@ -82,22 +68,22 @@ def run(options: argparse.Namespace, console: Console) -> int:
         suite = choose("suite", options.suite, tuple(suites.SUITES))
         specs = suites.SUITES[suite](names, list(seeds))
     common = {
-        "env_settings": parse_settings(options.env),
-        "vehicle_changes": parse_settings(options.vehicle_set),
+        "env_settings": shared.parse_settings(options.env),
+        "vehicle_changes": shared.parse_settings(options.vehicle_set),
     }
     if options.control_period is not None:
         common["control_period"] = options.control_period
     if options.conditions is not None or options.conditions_set:
-        specs = [{**spec, "conditions": conditions_of(options)} for spec in specs]
-    own = agent_settings(options.agent_set, [spec["agent"] for spec in specs])
+        specs = [{**spec, "conditions": shared.conditions_of(options)} for spec in specs]
+    own = shared.agent_settings(options.agent_set, [spec["agent"] for spec in specs])
     specs = distinct(
         [merged(spec, {**common, "agent_settings": own[spec["agent"]]}) for spec in specs]
     )
     settings = {
         "suite": suite, "agents": names, "seeds": list(seeds), **common,
-        "agent_settings": parse_settings(options.agent_set),
+        "agent_settings": shared.parse_settings(options.agent_set),
     }  # fmt: skip
-    with resumable(options, console, "the same command with --resume"):
+    with shared.resumable(options, console, "the same command with --resume"):
         store = run_benchmark(
             specs, options.out, workers=options.workers, settings=settings,
             resume=options.resume, console=console,

@@ -5,34 +5,21 @@ from pathlib import Path
 
 from rich.console import Console
 
-from experiments.commands.options import (
-    add_agent_settings,
-    add_agents,
-    add_conditions,
-    add_seed,
-    add_settings,
-    add_speed_modes,
-    add_trajectories,
-    add_vehicles,
-    agent_settings,
-    conditions_of,
-    only_one,
-    parse_settings,
-)
+from experiments.commands import options as shared
 
 EXAMPLE = "lpv-track drive --agents lpv-nmpc pure-pursuit --trajectory T2 --video out.mp4"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    add_agents(parser, "default: lpv-nmpc; several drive the same case, side by side")
-    add_trajectories(parser, ["T2"])
-    add_vehicles(parser, ["m2-minibus"])
-    add_speed_modes(parser, ["variable"])
-    add_conditions(parser)
-    add_seed(parser)
-    add_agent_settings(parser)
-    add_settings(parser, "--env")
+    shared.add_agents(parser, "default: lpv-nmpc; several drive the same case, side by side")
+    shared.add_trajectories(parser, ["T2"])
+    shared.add_vehicles(parser, ["m2-minibus"])
+    shared.add_speed_modes(parser, ["variable"])
+    shared.add_conditions(parser)
+    shared.add_seed(parser)
+    shared.add_agent_settings(parser)
+    shared.add_settings(parser, "--env")
     parser.add_argument(
         "--frames", type=Path, metavar="DIR", help="write PNG frames, open no window"
     )
@@ -61,17 +48,17 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from experiments.run.case import Case
 
     names = options.agents or ["lpv-nmpc"]
-    settings = agent_settings(options.agent_set, names)
+    settings = shared.agent_settings(options.agent_set, names)
     cases = [
         Case(
             agent=name,
-            trajectory=only_one("trajectory", options.trajectories),
-            vehicle=only_one("vehicle", options.vehicles),
-            speed_mode=only_one("speed mode", options.speed_modes),
-            conditions=conditions_of(options),
+            trajectory=shared.only_one("trajectory", options.trajectories),
+            vehicle=shared.only_one("vehicle", options.vehicles),
+            speed_mode=shared.only_one("speed mode", options.speed_modes),
+            conditions=shared.conditions_of(options),
             seed=options.seed,
             agent_settings=settings[name],
-            env_settings=parse_settings(options.env),
+            env_settings=shared.parse_settings(options.env),
         )
         for name in names
     ]

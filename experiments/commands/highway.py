@@ -9,18 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from experiments.commands.options import (
-    add_agent_settings,
-    add_agents,
-    add_out,
-    add_seeds,
-    add_settings,
-    add_workers,
-    agent_settings,
-    parse_settings,
-    resumable,
-    seeds_of,
-)
+from experiments.commands import options as shared
 
 EXAMPLE = "lpv-track highway --scene racetrack --agents lpv-nmpc ppo idm --seeds 20"
 
@@ -32,13 +21,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="racetrack (default), racetrack-large, racetrack-oval, roundabout, "
         "roundabout-generic",
     )  # fmt: skip
-    add_agents(
+    shared.add_agents(
         parser,
         "names of agents, files of policies; idm and idm-mobil are highway-env's own "
         "(default: lpv-nmpc ppo stanley idm idm-mobil)",
         ["lpv-nmpc", "ppo", "stanley", "idm", "idm-mobil"],
     )
-    add_seeds(parser, 20)
+    shared.add_seeds(parser, 20)
     parser.add_argument(
         "--other-vehicles", type=int, metavar="N",
         help="in the scene's terms: racetracks draw 1 to N (default: highway-env's own, 1)",
@@ -46,8 +35,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--laps", type=int, default=1, metavar="N", help="default 1")
     parser.add_argument("--conditions", default="simulation", metavar="NAME")
     parser.add_argument("--control-period", type=float, default=0.05, metavar="S")
-    add_settings(parser, "--env", "settings of the environment", nargs="*")
-    add_agent_settings(parser, nargs="*")
+    shared.add_settings(parser, "--env", "settings of the environment", nargs="*")
+    shared.add_agent_settings(parser, nargs="*")
     parser.add_argument(
         "--video", type=Path, metavar="FILE",
         help="in place of the table a video, .mp4 or .gif, of the last seed; this project's "
@@ -57,8 +46,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--frames", type=Path, metavar="DIR", help="likewise PNG files, one every --every steps"
     )
     parser.add_argument("--every", type=int, default=20, metavar="N", help="default 20")
-    add_out(parser, "results/highway")
-    add_workers(parser)
+    shared.add_out(parser, "results/highway")
+    shared.add_workers(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -77,11 +66,13 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from lpv_track_env.highway.env import HighwayTrackEnv
     from trajectories.naming import choose
 
-    seeds = seeds_of(options)
+    seeds = shared.seeds_of(options)
     choose("scene", options.scene, tuple(scenes.SCENES))
     conditions.load(options.conditions)
-    own = agent_settings(options.agent_set, [name for name in options.agents if name not in OWN])
-    env_settings: dict[str, Any] = {"laps": options.laps, **parse_settings(options.env)}
+    own = shared.agent_settings(
+        options.agent_set, [name for name in options.agents if name not in OWN]
+    )
+    env_settings: dict[str, Any] = {"laps": options.laps, **shared.parse_settings(options.env)}
     for key in env_settings:
         choose("environment setting", key, keyword_settings(HighwayTrackEnv))
     if options.other_vehicles is not None:
@@ -112,7 +103,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         TrafficCase(**spec).check()
     # Refuse settings that the environment does not accept before anything is driven.
     TrafficCase(**specs[0]).make_env().close()
-    with resumable(options, console):
+    with shared.resumable(options, console):
         store = run_benchmark(
             specs, options.out, workers=options.workers, console=console, kind=TrafficCase,
             settings={"experiment": "highway", "drives": len(specs)},

@@ -122,10 +122,7 @@ def run_job(
 def claimed(folder: Path, settings: Settings, kind: str) -> Iterator[bool]:
     """Make a folder a job's own; the value is True if it holds the same job already.
 
-    Parameters
-    ----------
-    kind
-        "training" or "tuning", for the messages.
+    `kind` is "training" or "tuning", for the messages.
 
     Raises
     ------
@@ -135,8 +132,12 @@ def claimed(folder: Path, settings: Settings, kind: str) -> Iterator[bool]:
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
         stored = stored_settings(folder, kind)
-        if stored is not None and (differs := difference(settings, stored)):
-            raise ValueError(f"{folder} holds a {kind} with other settings: {differs}")
+        for key, value in settings.as_dict().items():
+            if stored is not None and stored.get(key) != value:
+                raise ValueError(
+                    f"{folder} holds a {kind} with other settings: {key} is {value!r}, "
+                    f"there {stored.get(key)!r}"
+                )
         yield stored is not None
 
 
@@ -183,14 +184,6 @@ def stored_settings(folder: Path, kind: str) -> Mapping[str, Any] | None:
 def write_settings(folder: Path, settings: Settings) -> None:
     """Write the settings of a job."""
     write_atomically(folder / SETTINGS, json.dumps(settings.as_dict(), indent=2).encode())
-
-
-def difference(settings: Settings, stored: Mapping[str, Any]) -> str | None:
-    """Describe the first difference between settings and stored ones; None if they are equal."""
-    for key, value in settings.as_dict().items():
-        if stored.get(key) != value:
-            return f"{key} is {value!r}, there {stored.get(key)!r}"
-    return None
 
 
 def plain_values(settings: Any, named: Iterable[str]) -> dict[str, Any]:

@@ -46,22 +46,7 @@ def run_benchmark(
 ) -> ResultStore:
     """Run the cases that the folder does not hold yet, and store each as it ends.
 
-    Parameters
-    ----------
-    specs
-        Fields of the cases.
-    folder
-        Folder of the results.
-    workers
-        Number of processes.
-    settings
-        Entries of the manifest.
-    console
-        Receives the progress.
-    resume
-        Whether the folder may hold results already.
-    kind
-        Class of the cases.
+    `specs` are the fields of cases of the class `kind`, `settings` entries of the manifest.
 
     Raises
     ------

@@ -260,20 +260,10 @@ def project_digest() -> str:
 
 
 def run_case(spec: Mapping[str, Any], kind: type[BaseCase] = Case) -> dict[str, Any]:
-    """Run one case; what fails within the case becomes its result, not an exception.
+    """Run one case; an exception in it becomes its result.
 
-    Parameters
-    ----------
-    spec
-        Fields of the case.
-    kind
-        Class of the case.
-
-    Returns
-    -------
-    dict
-        `id`, the spec's fields, `status` ("ok" or "failed" with `error`), `seconds`, and the
-        entries of the case's `drive`.
+    The result has `id`, the spec's fields, `status` ("ok" or "failed" with `error`), `seconds`, and
+    the entries of the case's `drive`.
     """
     case = kind(**spec)
     result: dict[str, Any] = {"id": case.id, **case.as_dict(), "status": "ok", "end": None}

@@ -79,19 +79,9 @@ def local_pool(
 ) -> Iterator[Result]:
     """Run specs over `workers` processes and yield results as they end.
 
-    Parameters
-    ----------
-    specs
-        Arguments of `run`.
-    workers
-        Number of processes.
-    run
-        Function that makes a result; it must be picklable. Default: that of `Case`.
-    started
-        Called with each spec as it starts.
-    died
-        Function that makes the result of a spec that killed its worker twice. Default: that of
-        `Case`.
+    `run` makes the result of a spec and must be picklable; `died` makes that of a spec that killed
+    its worker twice; both are those of `Case` by default. `started` is called with each spec as it
+    starts.
 
     Raises
     ------

@@ -39,13 +39,8 @@ def paired_gain(ours: Array, theirs: Array, *, seed: int = 0) -> Interval:
     interquartile mean over trainings. The bootstrap draws trainings and paths with replacement;
     the drives of a path stay together.
 
-    Parameters
-    ----------
-    ours, theirs
-        Scores, (trainings, paths, drives); training i of one is compared with training i of the
-        other, drive by drive.
-    seed
-        Seed of the resampling.
+    Scores are (trainings, paths, drives); training i of one is compared with training i of the
+    other, drive by drive. `seed` is that of the resampling.
     """
     if ours.shape != theirs.shape or ours.ndim != 3:
         raise ValueError(f"scores must be alike in shape, not {ours.shape} and {theirs.shape}")

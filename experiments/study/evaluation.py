@@ -118,12 +118,7 @@ class Evaluator:
     def evaluate(self, result: Result, *, by_path: bool = False) -> dict[str, Array]:
         """Drive the set; return the figures of every drive, (paths, seeds) each, by `FIGURES`.
 
-        Parameters
-        ----------
-        result
-            A schedule or a policy.
-        by_path
-            Choose a schedule's set once, by the path's sharpest curvature.
+        With `by_path`, a schedule's set is chosen once, by the path's sharpest curvature.
         """
         rows = [self._drive(envs, result, by_path) for envs in self.drives]
         return {name: np.stack([row[name] for row in rows]) for name in FIGURES}

@@ -89,16 +89,9 @@ def study_oracles(
 
 
 def pool_of(count: int, found: Sequence[TrackingWeights], seed: int = 0) -> Array:
-    """Return sets of weights (sets, 10): default, those found, and a Sobol sequence over the span.
+    """Return sets of weights (sets, 10): default, `found` by tunings, a Sobol sequence in the span.
 
-    Parameters
-    ----------
-    count
-        Length of the sequence, a power of two.
-    found
-        Results of tunings.
-    seed
-        Seed of the sequence's scrambling.
+    `count` is the length of the sequence, a power of two, and `seed` the seed of its scrambling.
     """
     limit = np.log(SPAN)
     points = qmc.Sobol(DIRECTIONS["stages"].shape[1], seed=seed).random(count)
@@ -146,16 +139,10 @@ class Headroom:
 
 
 def headroom(scores: Array, known: Array) -> list[Headroom]:
-    """Return the headroom of knowing path, conditions, or the drive itself.
+    """Return the best fixed set, then the headroom of knowing path, conditions, or the drive.
 
-    The first row is the best fixed set.
-
-    Parameters
-    ----------
-    scores
-        Scores of the pool, (paths, sets, seeds).
-    known
-        Conditions `KNOWN` of the drives, (paths, seeds, 3).
+    `scores` are those of the pool, (paths, sets, seeds); `known` the conditions `KNOWN` of the
+    drives, (paths, seeds, 3).
     """
     paths, _, seeds = scores.shape
     cells = ((known > np.median(known, axis=(0, 1))) @ (1 << np.arange(known.shape[2]))).astype(int)
