@@ -66,7 +66,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--drives", type=int, metavar="N",
-        help="drives that judge a candidate (default 16), environments of PPO (default 64), drives "
+        help="drives that score a candidate (default 16), environments of PPO (default 64), drives "
         "of paired (default 32)",
     )  # fmt: skip
     parser.add_argument(

@@ -55,7 +55,7 @@ def lines(folder: Path) -> list[dict[str, Any]]:
 
 
 def outcome(folder: Path) -> dict[str, Any]:
-    """What must not depend on when and where the cases ran: no times, no order."""
+    """Return the part of results that depends on neither time nor place: no times, no order."""
     found = lines(folder)
     assert len({case["id"] for case in found}) == len(found)
     return {case["id"]: (case["status"], case["end"], case["metrics"]) for case in found}

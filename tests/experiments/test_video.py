@@ -24,7 +24,7 @@ MANY = 25
 
 
 def read(file: Path) -> tuple[dict[str, Any], list[Frame]]:
-    """What an independent reader makes of a video."""
+    """Return the properties and frames of a video, read independently."""
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the extra 'video' is not installed")
     reader = ffmpeg.read_frames(str(file))
     about = next(reader)
@@ -203,7 +203,7 @@ def test_drive_refuses_in_one_line(
 def test_frames_are_as_many_as_their_rate_asks_for(
     period: float, fps: float | None, speed_up: float, expected: int, tmp_path: Path
 ) -> None:
-    """Of 100 steps."""
+    """Frames of 100 steps, spread evenly."""
     sink = VideoSink(tmp_path / "out.mp4", period, fps, speed_up)
     copies = [sink.copies(step) for step in range(1, 101)]
     assert sum(copies) == expected

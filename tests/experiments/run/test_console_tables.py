@@ -1,4 +1,4 @@
-"""What a terminal shows of results: a screen of them, or all tables; progress in few lines."""
+"""Tables on a terminal: a screen of them, or all; progress in few lines."""
 
 import io
 from collections.abc import Iterator

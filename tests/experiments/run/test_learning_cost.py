@@ -1,4 +1,4 @@
-"""What learning cost: in the results of learned policies, beside them in report and table."""
+"""Cost of learning in the results of learned policies, in report and table."""
 
 import json
 

@@ -89,7 +89,7 @@ def test_scores_in_bands_are_those_of_their_periods() -> None:
 
 
 def test_a_band_s_score_is_of_its_periods_alone() -> None:
-    """Of made traces: lateral errors of two sizes, each in a band of its own."""
+    """Made traces have lateral errors of two sizes, each in a band of its own."""
     path = trajectories.load("figure-eight")
     places = np.linspace(0.0, path.length, 400, endpoint=False)
     bands = CurvatureBands().classify(path.sample(places).curvature)
@@ -151,7 +151,7 @@ def test_an_evaluated_schedule_drives_as_the_benchmarks_agent(
 
 
 def driven(agent: str, seed: int, conditions: str, **settings: Any) -> dict[str, Any]:
-    """What `run_case` does, for settings that no file holds."""
+    """Drive as `run_case` does, for settings that no file holds."""
     case = Case(agent, "figure-eight", conditions=conditions, seed=seed, env_settings=SETTINGS)
     env = case.make_env()
     found = rollout(env, agents.make(agent, env, **settings), seed=seed)
