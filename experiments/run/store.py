@@ -24,6 +24,13 @@ from trajectories.fileio import write_atomically
 Array = NDArray[np.float64]
 
 
+def write_arrays(file: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays by name as a compressed .npz, atomically."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_atomically(file, buffer.getvalue())
+
+
 class ResultStore:
     """Results of one benchmark in a folder, which is created if it does not exist.
 
@@ -42,12 +49,7 @@ class ResultStore:
         """Store one result: its trace first, then its line, both on disk when this returns."""
         line = {key: value for key, value in result.items() if key != "trace"}
         if result.get("trace"):
-            buffer = io.BytesIO()
-            arrays: dict[str, Any] = {
-                name: np.asarray(values) for name, values in result["trace"].items()
-            }
-            np.savez_compressed(buffer, **arrays)
-            write_atomically(self.folder / "traces" / f"{result['id']}.npz", buffer.getvalue())
+            write_arrays(self.folder / "traces" / f"{result['id']}.npz", result["trace"])
         self._drop_torn_line()
         with self.cases_file.open("ab") as handle:
             handle.write(json.dumps(line, sort_keys=True, allow_nan=False).encode() + b"\n")

@@ -5,7 +5,6 @@ study holds `trainings/LABEL-SEED/` as `lpv-track tune` leaves them, and `judged
 with the evaluation of each. Only what is missing is made, so a study resumes where it stopped.
 """
 
-import io
 import json
 import zipfile
 import zlib
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from agents.weight_tuning.policy import load
 from experiments.jobs.job import PROGRESS, Line, Listener, read_lines
 from experiments.run.engines import local_pool
+from experiments.run.store import write_arrays
 from experiments.study.evaluation import FIGURES, EvaluationSet, Evaluator
 from experiments.tuning.loop import WEIGHTS, tune
 from experiments.tuning.settings import TuningSettings, usual
@@ -218,14 +218,6 @@ def read_figures(file: Path) -> Figures:
         ) from None
 
 
-def write_figures(file: Path, figures: Figures) -> None:
-    """Write figures atomically."""
-    buffer = io.BytesIO()
-    named: Any = {name: figures[name] for name in FIGURES}
-    np.savez_compressed(buffer, **named)
-    write_atomically(file, buffer.getvalue())
-
-
 # Trainings and evaluations ------------------------------------------------------------------------
 
 
@@ -242,7 +234,7 @@ def evaluate_one(spec: Mapping[str, Any]) -> dict[str, Any]:
     evaluator = Evaluator(given)
     for label, weights, file in spec["todo"]:
         figures = evaluator.evaluate(load(Path(weights)), by_path=rung_of(label).by_path)
-        write_figures(Path(file), figures)
+        write_arrays(Path(file), figures)
     return {"set": given.name}
 
 

@@ -8,7 +8,6 @@ far how the cost depends on actions and features; the policy, one linear layer, 
 action that minimises it.
 """
 
-import io
 import math
 import zipfile
 from collections.abc import Mapping
@@ -26,10 +25,10 @@ from agents.weight_tuning.features import subset_mask
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import FAILED, SCALES, failed, rms_so_far, scores_of, squares_of
 from experiments.jobs.job import episode_seed
+from experiments.run.store import write_arrays
 from experiments.tuning.settings import TuningSettings
 from experiments.tuning.tuner import Array, Tuner, choice_of, environments, threads, unusable
 from trajectories import ReferencePath
-from trajectories.fileio import write_atomically
 
 STATE = "paired.npz"
 LARGEST = 4.0
@@ -292,14 +291,15 @@ class PairedLearning(Tuner):
 
     def save(self, folder: Path) -> None:
         """Write the model's sums, the policies and the counters."""
-        buffer, model = io.BytesIO(), self.model
-        np.savez(
-            buffer, policy=self.policy, mean=self._mean, squares=model.squares,
-            products=model.products,
-            numbers=[self._averaged, self._rounds, self._solves, model.count, model.total,
-                     model.noise],
-        )  # fmt: skip
-        write_atomically(folder / STATE, buffer.getvalue())
+        model = self.model
+        numbers = [
+            self._averaged, self._rounds, self._solves, model.count, model.total, model.noise,
+        ]  # fmt: skip
+        arrays = {
+            "policy": self.policy, "mean": self._mean, "squares": model.squares,
+            "products": model.products, "numbers": numbers,
+        }  # fmt: skip
+        write_arrays(folder / STATE, arrays)
 
     def read_state(self, folder: Path) -> bool:
         """Read the state that `save` wrote; False if there is none."""

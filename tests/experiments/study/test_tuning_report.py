@@ -11,10 +11,11 @@ import pytest
 
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments.jobs.job import PROGRESS
+from experiments.run.store import write_arrays
 from experiments.study.evaluation import FIGURES, IN_BANDS, EvaluationSet
 from experiments.study.oracle import Headroom
 from experiments.study.report import write_report
-from experiments.study.study import BASELINE, Study, write_figures
+from experiments.study.study import BASELINE, Study
 from experiments.study.tables import rung_result
 from experiments.tuning.loop import WEIGHTS
 from trajectories import CurvatureBands
@@ -46,7 +47,7 @@ def fixture_made(tmp_path: Path) -> Study:
                 **dict.fromkeys(FIGURES, zero), **dict.fromkeys(IN_BANDS, np.nan * zero),
                 "score": score, "lateral": score, "in_straight": score,
             }  # fmt: skip
-            write_figures(made.evaluation(given.name, one.label, seed), figures)
+            write_arrays(made.evaluation(given.name, one.label, seed), figures)
     return made
 
 

@@ -22,6 +22,7 @@ from experiments.commands.tune import settings_of
 from experiments.run.case import Case, run_case
 from experiments.run.metrics import evaluate
 from experiments.run.rollout import rollout
+from experiments.run.store import write_arrays
 from experiments.study import study
 from experiments.study.evaluation import (
     FIGURES,
@@ -42,7 +43,6 @@ from experiments.study.study import (
     run_evaluations,
     run_trainings,
     rung_of,
-    write_figures,
 )
 from experiments.tuning.settings import LEARNED, usual
 from lpv_track_env import kernels
@@ -304,7 +304,7 @@ def test_damaged_figures_are_one_line(tmp_path: Path) -> None:
     file = tmp_path / "judged" / "figures.npz"
     rng = np.random.default_rng(0)
     figures = {name: rng.normal(size=(3, 4)) for name in FIGURES}
-    write_figures(file, figures)
+    write_arrays(file, figures)
     for name, values in read_figures(file).items():
         np.testing.assert_array_equal(values, figures[name])
     good = file.read_bytes()
