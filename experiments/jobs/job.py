@@ -132,12 +132,8 @@ def claimed(folder: Path, settings: Settings, kind: str) -> Iterator[bool]:
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
         stored = stored_settings(folder, kind)
-        for key, value in settings.as_dict().items():
-            if stored is not None and stored.get(key) != value:
-                raise ValueError(
-                    f"{folder} holds a {kind} with other settings: {key} is {value!r}, "
-                    f"there {stored.get(key)!r}"
-                )
+        if stored is not None and (differs := difference(settings, stored)):
+            raise ValueError(f"{folder} holds a {kind} with other settings: {differs}")
         yield stored is not None
 
 
@@ -184,6 +180,14 @@ def stored_settings(folder: Path, kind: str) -> Mapping[str, Any] | None:
 def write_settings(folder: Path, settings: Settings) -> None:
     """Write the settings of a job."""
     write_atomically(folder / SETTINGS, json.dumps(settings.as_dict(), indent=2).encode())
+
+
+def difference(settings: Settings, stored: Mapping[str, Any]) -> str | None:
+    """Describe the first difference between settings and stored ones; None if they are equal."""
+    for key, value in settings.as_dict().items():
+        if stored.get(key) != value:
+            return f"{key} is {value!r}, there {stored.get(key)!r}"
+    return None
 
 
 def plain_values(settings: Any, named: Iterable[str]) -> dict[str, Any]:
