@@ -6,6 +6,7 @@ drive: in SB3's `evaluate_policy`, in this project's rollouts and in its reports
 """
 
 import math
+import os
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sized
@@ -142,8 +143,10 @@ def check_compatible(
             f"{task.control_period:g}: make the environment with {period}, or train one for it"
         )
     if isinstance(vehicle, str) and vehicle != task.vehicle.name:
+        # Results hold warnings: a shipped policy is named without this installation's folder.
+        shown = name.replace(f"{CHECKPOINTS}{os.sep}", "")
         warnings.warn(
-            f"{name} was trained for vehicle {vehicle!r}, not for {task.vehicle.name!r}",
+            f"{shown} was trained for vehicle {vehicle!r}, not for {task.vehicle.name!r}",
             UserWarning,
             stacklevel=stacklevel,
         )

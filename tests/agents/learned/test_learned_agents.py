@@ -320,3 +320,6 @@ def test_another_vehicle_than_in_training_is_said_in_the_result(tmp_path: Path) 
     assert run_case(spec)["warnings"] == []
     (said,) = run_case({**spec, "vehicle": "course-car"})["warnings"]
     assert "was trained for vehicle 'm2-minibus', not for 'course-car'" in said
+    # A shipped policy's own folder would make results differ from installation to installation.
+    (said,) = run_case({**spec, "agent": "ppo", "vehicle": "course-car"})["warnings"]
+    assert said == "policy ppo.json was trained for vehicle 'm2-minibus', not for 'course-car'"
