@@ -20,6 +20,7 @@ import lpv_track_env
 import trajectories
 from agents.base import CHECKPOINTS
 from agents.registry import check_settings, source_file
+from agents.weights import weights_from
 from experiments.run import learning_cost, metrics
 from experiments.run.computing import ComputingTimes
 from experiments.run.provenance import file_digest
@@ -164,6 +165,9 @@ class Case(BaseCase):
             For an unknown one, listing the known ones and the nearest.
         """
         check_settings(self.agent, self.agent_settings)
+        weights = self.agent_settings.get("weights")
+        if self.agent in agents.names() and isinstance(weights, Mapping):
+            weights_from(weights)
         trajectories.load(self.trajectory)
         choose("speed mode", self.speed_mode, SPEED_MODES)
         conditions.load(self.plain_conditions)

@@ -111,6 +111,16 @@ def test_weights_and_schedules_are_typed_as_they_are_written(tmp_path: Path) -> 
     assert len(labels) == 3
 
 
+def test_weights_that_cannot_be_used_are_refused_before_a_drive(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = 'weights={"Q":[1,1,20],"S":[5,5,100,100],"R":[0.01,1]}'
+    out = tmp_path / "out"
+    assert main(["benchmark", "--agents", "lpv-nmpc", "--agent-set", bad, "--out", str(out)]) == 2
+    assert capsys.readouterr().err == "lpv-track: weights: Q needs 4 weights, not 3\n"
+    assert not out.exists()
+
+
 def test_long_settings_are_no_names_of_files() -> None:
     long = {"weights": {"provenance": "x" * 300}}
     assert Case("lpv-nmpc", "T2", agent_settings=long).id != Case("lpv-nmpc", "T2").id
