@@ -9,16 +9,17 @@ from pathlib import Path
 import pytest
 
 SLOW = (
-    "agents/nmpc/test_f", "agents/nmpc/test_nmpc", "agents/nmpc/test_rti", "agents/test_agents",
-    "agents/test_delay", "agents/test_sb3", "agents/learned", "agents/weight_tuning",
-    "experiments/commands", "experiments/parallel", "experiments/report/test_report_browser",
-    "experiments/robustness", "experiments/ros", "experiments/run/test_computing",
+    "agents/nmpc/test_f", "agents/nmpc/test_lin", "agents/nmpc/test_nmpc", "agents/nmpc/test_qp",
+    "agents/nmpc/test_rti",
+    "agents/test_agents", "agents/test_delay", "agents/test_sb3", "agents/learned",
+    "agents/weight_tuning", "experiments/commands", "experiments/parallel",
+    "experiments/report/test_report_browser", "experiments/ros", "experiments/run/test_computing",
     "experiments/run/test_engines", "experiments/run/test_learning_cost",
     "experiments/run/test_rollout", "experiments/speed", "experiments/study",
     "experiments/training", "experiments/tuning", "experiments/verify", "experiments/test_",
     "lpv_track_env/conditions/test_conditions_episode", "lpv_track_env/estimation",
     "lpv_track_env/highway", "lpv_track_env/test_plants", "lpv_track_env/test_rendering",
-    "project/test_docs", "project/test_examples",
+    "project/test_docs", "project/test_examples", "trajectories/test_compilation",
 )  # fmt: skip
 """Beginnings of paths below this folder."""
 
