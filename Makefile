@@ -6,11 +6,12 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup setup-dev setup-docs benchmark test test-fast lint docs clean
+.PHONY: help setup setup-dev setup-docs benchmark test test-fast campaigns lint docs clean
 help:
 	@echo "make benchmark   drive the paper's six trajectories, print the table, write results/benchmark/report.html"
 	@echo "make test        run the tests"
 	@echo "make test-fast   run the tests that take little time"
+	@echo "make campaigns   try to break everything for an hour or so: kills, hostile files, numbers and commands"
 	@echo "make lint        ruff, mypy and the import-direction contract"
 	@echo "make docs        the site, into build/site: open build/site/index.html"
 	@echo "make setup       the set-up of 'make benchmark' alone (setup-dev: that of test and lint; setup-docs)"
@@ -44,6 +45,9 @@ test: setup-dev
 
 test-fast: setup-dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+
+campaigns: setup-dev
+	$(BIN)/python -m tests.campaigns
 
 lint: setup-dev
 	$(BIN)/ruff check .

@@ -12,7 +12,7 @@ SLOW = (
     "agents/nmpc/test_f", "agents/nmpc/test_lin", "agents/nmpc/test_nmpc", "agents/nmpc/test_qp",
     "agents/nmpc/test_rti",
     "agents/test_agents", "agents/test_delay", "agents/test_sb3", "agents/learned",
-    "agents/weight_tuning", "experiments/commands", "experiments/parallel",
+    "agents/weight_tuning", "campaigns", "experiments/commands", "experiments/parallel",
     "experiments/report/test_report_browser", "experiments/ros", "experiments/run/test_computing",
     "experiments/run/test_engines", "experiments/run/test_learning_cost",
     "experiments/run/test_rollout", "experiments/speed", "experiments/study",

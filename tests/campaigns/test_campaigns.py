@@ -1,0 +1,23 @@
+"""A small share of every campaign."""
+
+import importlib
+import importlib.util
+
+import pytest
+
+from tests.campaigns.__main__ import CAMPAIGNS
+
+SMALL = {
+    "hostile_solves": 200, "hostile_files": 200, "hostile_commands": 20, "kill_jobs": 3,
+    "soak": 20_000,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(CAMPAIGNS))
+def test_nothing_breaks(name: str) -> None:
+    if importlib.util.find_spec(f"tests.campaigns.{name}") is None:
+        pytest.skip("not written yet")
+    module = importlib.import_module(f"tests.campaigns.{name}")
+    counts = module.run(SMALL[name], 1, lambda _: None)
+    assert counts.faults == []
+    assert counts.tried >= SMALL[name]
