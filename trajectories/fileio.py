@@ -1,119 +1,176 @@
-"""Read text files of points, and write any file as a whole or not at all."""
+"""Read files that anybody may have written, and write any file as a whole or not at all.
 
+Every reader of this project goes through `read_bytes`: only regular files up to a stated size are
+read. JSON must be UTF-8 with finite numbers, each key once, and little nesting. Anything else is a
+ValueError of one line that begins with the file's name.
+"""
+
+import json
 import math
 import os
+import reprlib
 import secrets
-from dataclasses import dataclass
+import stat
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+import msgspec
 
-Array = NDArray[np.float64]
+Value = TypeVar("Value")
 
-COLUMNS = {
-    "x": ("x", "x_m", "east", "east_m", "easting", "easting_m"),
-    "y": ("y", "y_m", "north", "north_m", "northing", "northing_m"),
-    "latitude": ("lat", "latitude", "lat_deg", "latitude_deg"),
-    "longitude": ("lon", "lng", "long", "longitude", "lon_deg", "longitude_deg"),
-    "height": ("h", "h_m", "height", "height_m", "alt", "alt_m", "altitude", "altitude_m", "ele"),
-    "time": ("t", "t_s", "time", "time_s", "timestamp"),
-    "width": ("w_tr_right_m", "w_tr_left_m"),
-}
-"""Names that a column of each quantity may have in a header, in lower case."""
+MOST_BYTES = 16 * 2**20
+"""Largest file that is read unless its reader says otherwise, bytes."""
+DEEPEST = 32
+"""Largest number of JSON objects and lists inside each other."""
+LARGEST_INTEGER = 2**63 - 1
+"""Largest integer in JSON, as in a 64-bit integer of NumPy."""
+SHORT = reprlib.Repr()
+SHORT.maxstring = SHORT.maxother = 80
 
 
-@dataclass(frozen=True)
-class TextTable:
-    """Cells of a text file: header (lower case, may be empty), rows and their line numbers."""
-
-    file: Path
-    header: tuple[str, ...]
-    rows: list[list[str]]
-    lines: list[int]
-
-    def fail(self, message: str) -> NoReturn:
-        """Raise a ValueError that begins with the file's name."""
-        raise ValueError(f"{self.file}: {message}")
-
-    def find(self, quantity: str) -> int | None:
-        """Return the index of a quantity's column, one of `COLUMNS`; None if there is none."""
-        for name in COLUMNS[quantity]:
-            if name in self.header:
-                return self.header.index(name)
-        return None
-
-    def column(self, index: int) -> Array:
-        """Return the numbers of a column, (n,); a cell that is not a finite number is an error."""
-        name = self.header[index] if self.header else str(index + 1)
-        values = np.empty(len(self.rows))
-        for k, (row, line) in enumerate(zip(self.rows, self.lines, strict=True)):
-            try:
-                values[k] = float(row[index])
-            except ValueError:
-                self.fail(f"line {line}, column {name}: {row[index][:40]!r} is not a number")
-            if not math.isfinite(values[k]):
-                self.fail(f"line {line}, column {name}: {row[index][:40]!r} is not finite")
-        return values
+def shown(value: object) -> str:
+    """Return the repr of a value that anybody may have given, shortened to fit on a line."""
+    return SHORT.repr(value)
 
 
-def read_text(file: str | Path) -> str:
-    """Read a text file; raise a ValueError of one line if it cannot be read."""
-    try:
-        return Path(file).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise ValueError(f"{file}: cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{file}: is not a text file (byte {error.start})") from error
+def shortened(text: object, most: int = 200) -> str:
+    """Return a text as one printable line; the middle of a text longer than `most` is left out."""
+    line = " ".join(str(text).split())
+    if len(line) > most:
+        line = f"{line[: most // 2]} ... {line[-most // 3 :]}"
+    return line if line.isprintable() else ascii(line)[1:-1]
 
 
-def read_table(file: str | Path) -> TextTable:
-    """Split a text file at `,` or `;`; its header may be a `#` comment or a line without numbers.
+def read_bytes(file: str | Path, limit: int = MOST_BYTES) -> bytes:
+    """Read a regular file of at most `limit` bytes.
 
     Raises
     ------
     ValueError
-        For a file that cannot be read or has no rows, or if rows differ in their number of cells.
+        In one line that begins with the file's name, for a pipe, device, folder, a larger file, or
+        one that cannot be read.
     """
-    comments: list[tuple[str, ...]] = []
-    header: tuple[str, ...] = ()
-    rows: list[list[str]] = []
-    lines: list[int] = []
-    for number, line in enumerate(read_text(file).split("\n"), start=1):
-        text = line.strip()
-        cells = [cell.strip() for cell in text.lstrip("#").split(";" if ";" in text else ",")]
-        if not text:
-            continue
-        if text.startswith("#"):
-            if not rows:
-                comments.append(tuple(cell.strip('" ').lower() for cell in cells))
-        elif not rows and not header and not any(map(is_number, cells)):
-            header = tuple(cell.strip('" ').lower() for cell in cells)
-        else:
-            rows.append(cells)
-            lines.append(number)
-    table = TextTable(Path(file), header, rows, lines)
-    if not rows:
-        table.fail("has no rows of numbers")
-    width = len(header or rows[0])
-    for row, number in zip(rows, lines, strict=True):
-        if len(row) != width:
-            table.fail(f"line {number} has {len(row)} columns, not {width}: torn or not a table")
-    if not header:
-        known = {name for group in COLUMNS.values() for name in group}
-        fitting = [c for c in comments if len(c) == width and len(known.intersection(c)) >= 2]
-        table = TextTable(table.file, fitting[-1] if fitting else (), rows, lines)
-    return table
-
-
-def is_number(text: str) -> bool:
-    """Return whether a cell can be read as a number; NaN and infinity count as numbers."""
+    name = shortened(file)
     try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+        with open(file, "rb", opener=_opened) as handle:
+            status = os.fstat(handle.fileno())
+            regular = stat.S_ISREG(status.st_mode)
+            content = handle.read(limit + 1) if regular else b""
+    except (OSError, ValueError) as error:  # ValueError: the name holds a NUL or half a surrogate
+        reason = getattr(error, "strerror", None) or shortened(error)
+        raise ValueError(f"{name}: cannot be read: {reason}") from error
+    if not regular:
+        raise ValueError(f"{name}: cannot be read: it is a pipe or device, no regular file")
+    if len(content) > limit:
+        size = max(status.st_size, len(content))
+        raise ValueError(f"{name}: {size} bytes are too many: at most {limit} are read")
+    return content
+
+
+def _opened(file: str, flags: int) -> int:
+    """Open without waiting for the writer of a pipe."""
+    return os.open(file, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def read_text(file: str | Path, limit: int = MOST_BYTES) -> str:
+    """Read a text file in UTF-8, with or without a byte order mark; errors as in `read_bytes`."""
+    return _decoded(read_bytes(file, limit), file)
+
+
+def _decoded(content: bytes, name: object) -> str:
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{shortened(name)}: is not a text file in UTF-8 (byte {error.start})"
+        ) from error
+
+
+def read_json(file: str | Path, limit: int = MOST_BYTES) -> Any:
+    """Read a JSON file; errors as in `read_bytes` and `parse_json`."""
+    return parse_json(read_bytes(file, limit), file)
+
+
+def parse_json(content: str | bytes, name: object) -> Any:
+    """Parse JSON; `name` says in messages where it is from, such as a file and line.
+
+    Raises
+    ------
+    ValueError
+        In one line that begins with `name`: for anything that is not JSON in UTF-8, a key twice in
+        an object, a number beyond double precision, an integer beyond 64 bits, or more than
+        `DEEPEST` objects and lists inside each other.
+    """
+    text = _decoded(content, name) if isinstance(content, bytes) else content
+    try:
+        found = json.loads(
+            text, object_pairs_hook=_unique, parse_constant=_refuse, parse_float=_finite,
+            parse_int=_integer,
+        )  # fmt: skip
+        _check_depth(found)
+        if "\\ud" in text.lower():  # half of a surrogate pair: such a text cannot be printed
+            json.dumps(found, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"{shortened(name)}: is not JSON: half of a surrogate pair") from None
+    except RecursionError:
+        raise ValueError(f"{shortened(name)}: is not JSON of ours: nested too deeply") from None
+    except ValueError as error:
+        raise ValueError(f"{shortened(name)}: is not JSON: {shortened(error)}") from error
+    return found
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        keys: set[str] = set()
+        twice = next(key for key, _ in pairs if key in keys or keys.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"key {shown(twice)} twice")
+    return found
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is no number")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{shown(text)} is beyond double precision")
+    return value
+
+
+def _integer(text: str) -> int:
+    if len(text) > 20 or abs(int(text)) > LARGEST_INTEGER:
+        raise ValueError(f"integer {shown(text)} is beyond 64 bits")
+    return int(text)
+
+
+def _check_depth(value: object) -> None:
+    level = [value]
+    for _ in range(DEEPEST + 1):
+        level = [
+            inner
+            for outer in level
+            if isinstance(outer, dict | list)
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+        ]
+        if not level:
+            return
+    raise RecursionError
+
+
+def checked(value: object, kind: type[Value], name: object) -> Value:
+    """Convert plain JSON to a type that msgspec knows: a dataclass, Struct, TypedDict, list[...].
+
+    Raises
+    ------
+    ValueError
+        In one line that begins with `name`, and names the place in the JSON.
+    """
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise ValueError(f"{shortened(name)}: {shortened(error)}") from error
 
 
 def write_atomically(file: Path, content: bytes) -> None:

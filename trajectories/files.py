@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trajectories.curvature import circle_curvature, signed_waypoint_curvature, statistics
-from trajectories.fileio import COLUMNS, TextTable, read_table, read_text, write_atomically
+from trajectories.fileio import read_text, write_atomically
 from trajectories.importers import read_gps, read_racetrack, read_xy
 from trajectories.path import ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
+from trajectories.text_table import COLUMNS, TextTable, read_table
 
 __all__ = ["read", "read_gps", "read_native", "read_racetrack", "read_xy", "write"]
 

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from trajectories.fileio import COLUMNS, TextTable, is_number, read_table
 from trajectories.geodesy import east_north_up
 from trajectories.path import MINIMUM_POINTS, SPACING, ReferencePath
 from trajectories.shapes import Geometry, from_geometry, smooth
 from trajectories.speed import SpeedLimits
+from trajectories.text_table import COLUMNS, TextTable, is_number, read_table
 
 Array = NDArray[np.float64]
 
