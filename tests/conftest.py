@@ -19,7 +19,8 @@ SLOW = (
     "experiments/training", "experiments/tuning", "experiments/verify", "experiments/test_",
     "lpv_track_env/conditions/test_conditions_episode", "lpv_track_env/estimation",
     "lpv_track_env/highway", "lpv_track_env/test_plants", "lpv_track_env/test_rendering",
-    "project/test_docs", "project/test_examples", "trajectories/test_compilation",
+    "project/test_compiling", "project/test_docs", "project/test_examples",
+    "trajectories/test_compilation", "trajectories/test_disk_cache",
 )  # fmt: skip
 """Beginnings of paths below this folder."""
 

@@ -2,10 +2,12 @@
 
 import gc
 import hashlib
+import os
 import sys
 import warnings
 from collections.abc import Callable
-from functools import cache
+from contextlib import suppress
+from functools import cache, update_wrapper
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,6 +15,9 @@ import numba
 from numba.core import event, types
 from numba.core.registry import CPUDispatcher
 from numba.core.types.functions import BaseFunction
+from numba.np.ufunc.parallel import threading_layer
+
+from trajectories.disk_cache import DiskCache, warn_of_no_cache
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -54,12 +59,37 @@ def compiled_inline(function: Function) -> Function:
     return _compile_internal(function, forceinline=True)
 
 
-def compiled_parallel(function: Function) -> Function:
+def compiled_parallel(function: Function) -> "Threaded":
     """`compiled`, with `numba.prange` loops run in threads, each calling one ordinary function.
 
     (A body that numba inlines into such a loop was seen to give wrong results.)
     """
-    return _compile(function, parallel=True, _nrt=True)
+    return Threaded(function)
+
+
+class Threaded:
+    """A compiled function whose loops run in threads, and in one after a fork that ends them.
+
+    GNU's OpenMP ends a process that starts threads after a fork from one that had them. There the
+    function runs in one thread, with the same results, and says so once.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        update_wrapper(self, function)
+        self.parallel: Any = _compile(function, parallel=True, _nrt=True)
+        self.alone: Any = _compile(function, _nrt=True)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function with loops in threads, if this process can have them."""
+        if _threads_lost:
+            warn_of_lost_threads()
+            return self.alone(*arguments)
+        return self.parallel(*arguments)
+
+    def entry_point(self, *arguments: Any) -> Callable[..., Any]:
+        """Return the machine code for these types of arguments; see `entry_point`."""
+        entry = entry_point(self.parallel, *arguments)
+        return lambda *given: self(*given) if _threads_lost else entry(*given)
 
 
 def compiled_with_lists(*folders: Path) -> Callable[[Function], Function]:
@@ -77,6 +107,8 @@ def entry_point(function: Callable[..., Any], *arguments: Any) -> Callable[..., 
     pass them: 0.2 us for a handful of arrays. A call of the returned function does not, so it must
     be given arguments of the very same types: an array of another layout would be misread.
     """
+    if isinstance(function, Threaded):
+        return function.entry_point(*arguments)
     if not isinstance(function, numba.core.dispatcher.Dispatcher):
         return function  # With NUMBA_DISABLE_JIT=1 it is plain Python.
     entry: Callable[..., Any] = function.compile(tuple(map(numba.typeof, arguments)))
@@ -88,16 +120,15 @@ def _compile(function: Function, *sources: Path, **more: bool | str) -> Function
     # compile. No memory can be allocated then, but views of arrays work.
     options: dict[str, Any] = {"error_model": "numpy", "fastmath": False, "_nrt": False, **more}
     _compiled_here.add(function)
-    try:
-        dispatcher = numba.njit(cache=True, **options)(function)
-    except RuntimeError:
-        _warn_of_no_cache()
-        return numba.njit(**options)(function)  # type: ignore[no-any-return]
-    index = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if index is not None and hasattr(index, "_source_stamp"):
-        folder = Path(function.__code__.co_filename).parent
-        folders = dict.fromkeys((*_packages_for(folder), *sources))
-        index._source_stamp = (index._source_stamp, source_digest(*folders))  # noqa: SLF001
+    dispatcher: Any = numba.njit(**options)(function)
+    if isinstance(dispatcher, numba.core.dispatcher.Dispatcher):
+        folders = _packages_for(Path(function.__code__.co_filename).parent)
+        digest = source_digest(*dict.fromkeys((*folders, *sources)))
+        try:
+            # As `njit(cache=True)` does with the cache that is numba's own.
+            dispatcher._cache = DiskCache(function, options, digest)  # type: ignore[attr-defined]  # noqa: SLF001
+        except RuntimeError:
+            warn_of_no_cache()
     return dispatcher  # type: ignore[no-any-return]
 
 
@@ -160,11 +191,26 @@ def _packages_for(folder: Path) -> list[Path]:
     return [HERE, *sorted(Path(str(one.__file__)).parent for one in libraries), own]
 
 
+_threads_lost = False
+"""True in a process forked from one that has run loops in OpenMP's threads."""
+
+
+def _after_fork() -> None:
+    global _threads_lost  # noqa: PLW0603
+    with suppress(ValueError):  # No loop has run in threads.
+        _threads_lost = _threads_lost or threading_layer() == "omp"  # type: ignore[no-untyped-call]
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
 @cache
-def _warn_of_no_cache() -> None:
+def warn_of_lost_threads() -> None:
+    """Warn, once in a process, that threads are lost by a fork."""
     warnings.warn(
-        "numba finds no writable cache folder: compiling anew in this process "
-        "(set NUMBA_CACHE_DIR to a writable folder to avoid the wait)",
+        "this process was forked from one that had run threads, which OpenMP does not allow here: "
+        "continuing with threads=1 (the start methods 'spawn' and 'forkserver' keep threads)",
         RuntimeWarning,
         stacklevel=4,
     )

@@ -188,17 +188,7 @@ class ReferencePath:
         """Interpolate at arc lengths s (m, any shape): wrapped if closed, clamped if open."""
         s = _finite("arc length", s)
         rows = np.empty((s.size, 7))
-        for k, value in enumerate(s.ravel()):
-            arguments = (self.table, self.length, self.closed, float(value))
-            index, _ = table.cell(float(value), self.length, self.closed, len(self.x))
-            rows[k] = (
-                *table.position_at(*arguments),
-                table.heading_at(*arguments),
-                table.curvature_at(*arguments),
-                table.speed_at(*arguments),
-                self.acceleration[index],
-                table.time_at(*arguments),
-            )
+        table.sample(self.table, self.length, self.closed, s.flatten(), self.acceleration, rows)
         return PathSample(*(column.reshape(s.shape) for column in rows.T))
 
     def project(self, x: float, y: float, near: float | None = None) -> Projection:

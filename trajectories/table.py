@@ -153,6 +153,25 @@ def arc_length_at(table: Table, length: Float, closed: bool, time: Float, index:
     return laps * length + index * spacing + offset, index
 
 
+@compiled
+def sample(
+    table: Table, length: Float, closed: bool, s: NDArray[Any], acceleration: NDArray[Any],
+    out: NDArray[Any],
+) -> None:  # fmt: skip
+    """Write x, y, heading, curvature, speed, acceleration and time at s (m,) into `out` (m, 7).
+
+    `acceleration` (n - 1,) or longer holds the reference's acceleration in each cell, m/s^2.
+    """
+    for k in range(s.shape[0]):
+        index, _ = cell(s[k], length, closed, table.shape[0])
+        out[k, 0], out[k, 1] = position_at(table, length, closed, s[k])
+        out[k, 2] = heading_at(table, length, closed, s[k])
+        out[k, 3] = curvature_at(table, length, closed, s[k])
+        out[k, 4] = speed_at(table, length, closed, s[k])
+        out[k, 5] = acceleration[index]
+        out[k, 6] = time_at(table, length, closed, s[k])
+
+
 @compiled_inline
 def fill_preview(
     table: Table, length: Float, closed: bool, s: Float, index: int, u: Float, period: Float,

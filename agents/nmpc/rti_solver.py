@@ -62,6 +62,12 @@ def roll_out_cost(stages: Array, lanes: Array, weights: Array, constants: Array)
 
 
 @compiled
+def cost_of_plan(stages: Array, lanes: Array, weights: Array, constants: Array) -> Float:
+    """Cost of the stages' NOW and of the slacks."""
+    return rti.cost_of(stages, lanes, L.NOW_A, weights, constants)
+
+
+@compiled
 def clamp_step(stages: Array, last_a: Float, last_delta: Float, constants: Array) -> None:
     """Clip the inputs in the stages' STEP to their bounds and rates."""
     qp.clamp(stages, L.STEP_A, last_a, last_delta, constants)
@@ -319,7 +325,7 @@ class RtiSolver:
         seconds = time.perf_counter() - began
         if status is not Status.SUCCESS:
             return Solution(status, iterations=turns, seconds=seconds)
-        cost = rti.cost_of(self._stages, self._lanes, L.NOW_A, weights, self.constants)
+        cost = cost_of_plan(self._stages, self._lanes, weights, self.constants)
         return Solution(
             status, self._inputs(), self._stages[:, L.NOW_VX : L.NOW_Y + 1].copy(),
             self._slack(), float(cost), turns, seconds,
