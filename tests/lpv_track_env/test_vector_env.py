@@ -481,3 +481,65 @@ def test_waiting_threads_do_not_spin() -> None:
         env=variables,
     )  # fmt: skip
     assert done.stdout.split() == ["None", "passive"]
+
+
+AFTER_FORK = """
+import multiprocessing
+import gymnasium
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv
+from lpv_track_env import PATH_TRACKING
+from lpv_track_env.vector_env import PathTrackingVectorEnv
+
+fork = multiprocessing.get_context("fork")
+env = PathTrackingVectorEnv(40, "straight", threads=2)
+env.reset(seed=0)
+action = np.full((40, 2), 0.1)
+env.step(action)
+
+def go_on(sent):
+    sent.send([env.step(action)[0] for _ in range(3)])
+
+received, sent = fork.Pipe(duplex=False)
+child = fork.Process(target=go_on, args=(sent,))
+child.start()
+assert received.poll(100.0)
+np.testing.assert_array_equal(received.recv(), [env.step(action)[0] for _ in range(3)])
+child.join(10.0)
+assert child.exitcode == 0
+
+class Inside(gymnasium.Env):
+    def __init__(self):
+        self.many = PathTrackingVectorEnv(2, "straight", threads=2)
+        self.observation_space = self.many.single_observation_space
+        self.action_space = self.many.single_action_space
+
+    def reset(self, **_):
+        return self.many.reset(seed=0)[0][0], {}
+
+    def step(self, action):
+        observations, rewards, *_ = self.many.step(np.stack([action, action]))
+        return observations[0], float(rewards[0]), False, False, {}
+
+for make in (Inside, lambda: gymnasium.make(PATH_TRACKING, trajectory="straight")):
+    many = AsyncVectorEnv([make, make], context="fork")
+    many.reset(seed=0)
+    _, rewards, *_ = many.step(np.zeros((2, 2), np.float32))
+    print(*rewards)
+    many.close()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+def test_a_process_forked_after_threads_goes_on_in_one() -> None:
+    """OpenMP would end it: `Terminating: fork() called from a process already using it`."""
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("numba sees one processor")
+    done = subprocess.run(
+        [sys.executable, "-c", AFTER_FORK], capture_output=True, text=True, timeout=200,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.split()) == 4
+    # Once in the first child and in each of the two that have such an environment inside.
+    assert done.stderr.count("continuing with threads=1") == 3
