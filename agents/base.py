@@ -7,9 +7,9 @@ drive: in SB3's `evaluate_policy`, in this project's rollouts and in its reports
 
 import math
 import os
+import reprlib
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sized
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
@@ -18,15 +18,16 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.inputs import foreign, observation_rows, started_rows
 from lpv_track_env.conditions import Actuation
 from lpv_track_env.conditions.vehicle import controlled_stop
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
+from lpv_track_env.validation import two_numbers
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 
 Action = NDArray[np.float32]
 Memory = TypeVar("Memory")
-BatchMemory = TypeVar("BatchMemory", bound=Sized)
 
 CHECKPOINTS = Path(__file__).parent / "checkpoints"
 """Folder of the policies that come with this project: NAME.json for the agent NAME."""
@@ -105,6 +106,16 @@ class DrivingTask:
             ) from None
 
 
+def checked_task(task: object) -> DrivingTask:
+    """Return a task; raise a TypeError for anything else, such as the environment itself."""
+    if not isinstance(task, DrivingTask):
+        raise TypeError(
+            f"task must be a DrivingTask, not {type(task).__name__}: agents.make(name, env) makes "
+            "it of an environment, DrivingTask.of(env) alone"
+        )
+    return task
+
+
 def check_compatible(
     name: str,
     task: DrivingTask,
@@ -174,56 +185,27 @@ def blind_control(
     )
 
 
-def observation_rows(observation: NDArray[Any], size: int) -> NDArray[np.float64]:
-    """Copy one observation (size,) or a batch (n, size) into rows (n, size) float64.
-
-    Raises
-    ------
-    ValueError
-        If the observation has another size.
-    """
-    rows = np.array(observation, dtype=np.float64, order="C")
-    if rows.ndim == 1:
-        rows = rows.reshape(1, -1)
-    if rows.ndim != 2 or rows.shape[1] != size:
-        raise ValueError(
-            f"observation has shape {np.shape(observation)}, this layout has {size} "
-            "entries, alone or in rows: make the agent for this environment"
-        )
-    return rows
-
-
-def batch_memory(
-    memory: BatchMemory | None,
-    rows: int,
-    episode_start: NDArray[np.bool_] | None,
-    new: Callable[[int], BatchMemory],
-) -> tuple[BatchMemory, NDArray[np.bool_]]:
-    """Return the memory of a batch, and a mask (rows,) of those in which an episode begins.
-
-    A missing memory, or one of another number of rows, is replaced by a new one; an episode then
-    begins in every row.
-    """
-    starts = np.zeros(rows, dtype=np.bool_)
-    if episode_start is not None:
-        starts[:] = episode_start
-    if memory is None or len(memory) != rows:
-        memory = new(rows)
-        starts[:] = True
-    return memory, starts
-
-
 class TrackingAgent(ABC, Generic[Memory]):
     """Base class of agents that are written as `control`, for one vehicle and one observation.
 
     Each row of a batch has its own memory, which is renewed where `episode_start` is True.
-    `control_blind` acts in place of `control` on observations with NaN or infinite entries.
+    `control_blind` acts in place of `control` on observations with NaN or infinite entries; finite
+    entries saturate at the bounds of the layout. Inputs that are not finite are replaced by a
+    controlled stop; the first one is told by a warning, `replaced_actions` counts all.
+
+    Raises
+    ------
+    TypeError
+        If `task` is not a `DrivingTask`.
     """
 
     def __init__(self, task: DrivingTask) -> None:
-        self.task = task
+        self.task = checked_task(task)
+        self.replaced_actions = 0
+        self._size = task.layout.size
         self._low, self._high = task.action_bounds
         self._memories: list[Memory] = []
+        self._kind: type | None = None
 
     @abstractmethod
     def control(self, observation: TrackingObservation, memory: Memory) -> tuple[float, float]:
@@ -268,25 +250,53 @@ class TrackingAgent(ABC, Generic[Memory]):
         Raises
         ------
         ValueError
-            If the observation does not have this agent's layout.
+            If the observation does not have this agent's layout, or an input has a wrong type.
+        TypeError
+            If `state` is not this agent's memory.
         """
-        values = np.asarray(observation)
-        rows = np.atleast_2d(values)
-        memories = self._memories if state is None else state
+        rows = observation_rows(observation, self._size)
+        memories = self._memories if state is None else self._own(state)
+        started = started_rows(episode_start, len(rows))
         if len(memories) != len(rows):
             memories = [self.new_memory() for _ in rows]
-        if episode_start is not None:
-            started = np.broadcast_to(np.asarray(episode_start, dtype=bool), (len(rows),))
-            memories = [
-                self.new_memory() if begins else memory
-                for begins, memory in zip(started, memories, strict=True)
-            ]
+        elif started:
+            memories = memories.copy()
+            for k in started:
+                memories[k] = self.new_memory()
         if state is None:
             self._memories = memories
         actions = np.empty((len(rows), 2), dtype=np.float32)
         for k, (row, memory) in enumerate(zip(rows, memories, strict=True)):
-            control = self.control if np.isfinite(row).all() else self.control_blind
-            actions[k] = control(self.task.layout.unpack(row), memory)
-        np.nan_to_num(actions, copy=False, nan=0.0)
-        np.clip(actions, self._low, self._high, out=actions)
-        return (actions[0] if values.ndim == 1 else actions), memories
+            actions[k] = self._bounded(row, memory)
+        return (actions[0] if np.ndim(observation) == 1 else actions), memories
+
+    def _own(self, state: list[Memory]) -> list[Memory]:
+        """Check that memories given by the caller are such as `new_memory` makes."""
+        if self._kind is None:
+            self._kind = type(self.new_memory())
+        if not isinstance(state, list):
+            raise foreign(state)
+        for memory in state:
+            if type(memory) is not self._kind:
+                raise foreign(memory)
+        return state
+
+    def _bounded(self, row: NDArray[np.float64], memory: Memory) -> tuple[float, float]:
+        """Return inputs for one observation, finite and within the bounds of the actions."""
+        observation = self.task.layout.unpack(row)
+        control = self.control if np.isfinite(row).all() else self.control_blind
+        given = control(observation, memory)
+        a, delta = two_numbers(given)
+        if not (math.isfinite(a) and math.isfinite(delta)):
+            if self.replaced_actions == 0:
+                warnings.warn(
+                    f"{type(self).__name__} returns inputs that are not finite: "
+                    f"{reprlib.repr(given)}; the vehicle is brought to a stop instead",
+                    UserWarning,
+                    stacklevel=3,
+                )
+            self.replaced_actions += 1
+            a, delta = blind_control(self.task.vehicle, observation)
+        # In this order a bound in the precision of the actions is exact.
+        (low_a, low_delta), (high_a, high_delta) = self._low, self._high
+        return min(max(a, low_a), high_a), min(max(delta, low_delta), high_delta)

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.base import Action, Agent, DrivingTask, batch_memory
+from agents.base import Action, Agent, DrivingTask
+from agents.inputs import memory_of, observation_rows, saturate_row, started_rows
 from agents.reference import (
     NODE,
     NODE_ARC_LENGTH,
@@ -91,7 +92,7 @@ def drive_on(
 def speed_of(nodes: Array, intervals: Any) -> Any:
     """Reference speed at a number of intervals after the first node."""
     steps = nodes.shape[0] - 1
-    k = min(math.floor(intervals), steps - 1)
+    k = min(max(math.floor(intervals), 0), steps - 1)
     share = min(intervals - k, 1.0)
     return nodes[k, NODE_SPEED] + share * (nodes[k + 1, NODE_SPEED] - nodes[k, NODE_SPEED])
 
@@ -209,18 +210,25 @@ def predict_observation(
     o[entry.LATERAL_ERROR] = (y - fy) * math.cos(heading) - (x - fx) * math.sin(heading)
     o[entry.HEADING_ERROR] = wrap(psi - heading)
     shift_preview(o, nodes, k, share, period)
+    saturate_row(o)
 
 
 @compiled
 def predict_observations(
     observations: Array, commands: Array, settings: Array, nodes: Array, foot_points: Array
 ) -> None:
-    """`predict_observation` for rows (n, size), in place; rows that are not finite stay."""
+    """`predict_observation` for rows (n, size), in place; rows that are not finite stay.
+
+    A last command that is not finite becomes what the actuators do.
+    """
     for row in range(observations.shape[0]):
         total = 0.0
         for j in range(observations.shape[1]):
             total += abs(observations[row, j])
         foot_points[row, 0] = foot_points[row, 1] = foot_points[row, 2] = 0.0
+        for j in range(2):
+            if not math.isfinite(commands[row, 0, j]):  # no command that an actuator follows
+                commands[row, 0, j] = observations[row, entry.ACCELERATION + j]
         if math.isfinite(total):
             predict_observation(observations[row], commands[row], settings, nodes, foot_points[row])
 
@@ -235,6 +243,11 @@ class DelayMemory:
     """Commands sent, the last one first, (n, rows, 2)."""
     foot_points: Array
     """Pose of the predicted foot point in the frame of the observed one, (n, FOOT)."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Sizes of the arrays, without the number of vehicles."""
+        return self.commands.shape[1:]
 
     def __len__(self) -> int:
         return len(self.commands)
@@ -336,6 +349,7 @@ class DelayCompensated:
         self.agent, self.task, self.actuation = agent, task, actuation
         self.future = NearFuture(task, actuation, model)
         self._memory: DelayMemory | None = None
+        self._blank = self.future.memory(0)
 
     def __getattr__(self, name: str) -> Any:
         if name == "agent":
@@ -356,16 +370,26 @@ class DelayCompensated:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Action, DelayMemory]:
-        """Return the action (2,) for one observation (size,), or (n, 2) for a batch; and memory."""
-        given = np.asarray(observation)
-        rows = np.array(np.atleast_2d(given), dtype=np.float64, order="C")
-        self.task.layout.unpack(rows)
-        kept = self._memory if state is None else state
-        memory, starts = batch_memory(kept, len(rows), episode_start, self.future.memory)
+        """Return the action (2,) for one observation (size,), or (n, 2) for a batch; and memory.
+
+        Raises
+        ------
+        ValueError
+            If the observation does not have this agent's layout.
+        TypeError
+            If `state` is not the memory of such an agent.
+        """
+        rows = observation_rows(observation, self.task.layout.size)
+        kept = self._memory
+        memory = memory_of(state, kept, len(rows), self._blank, self.future.memory)
+        starts = np.zeros(len(rows), dtype=np.bool_)
+        starts[started_rows(episode_start, len(rows))] = True
+        if memory is not state and memory is not kept:
+            starts[:] = True
         if state is None:
             self._memory = memory
         self.future.predict(rows, starts, memory)
-        shown = rows[0] if given.ndim == 1 else rows
+        shown = rows[0] if np.ndim(observation) == 1 else rows
         action, memory.inner = self.agent.predict(shown, memory.inner, starts, deterministic)
         self.future.record(memory, np.atleast_2d(action))
         return action, memory

@@ -13,8 +13,9 @@ from agents.base import (
     DrivingTask,
     blind_control,
     check_compatible,
-    observation_rows,
+    checked_task,
 )
+from agents.inputs import foreign, observation_rows, started_rows
 from agents.learned.network import Network
 from agents.learned.policy import ACTIONS, Policy, read
 from agents.nmpc.rti_agent import RtiMemory, RtiNmpc, RtiRow
@@ -43,7 +44,7 @@ class LearnedPolicy:
     """
 
     def __init__(self, task: DrivingTask, policy: str | Path | Policy) -> None:
-        self.task = task
+        self.task = checked_task(task)
         name = f"policy {policy.algorithm!r}" if isinstance(policy, Policy) else f"policy {policy}"
         self.policy = policy if isinstance(policy, Policy) else read(policy)
         check_compatible(
@@ -54,7 +55,8 @@ class LearnedPolicy:
         self._network = Network.of(self.policy, *task.action_bounds)
         self._base = RtiNmpc(task) if self.policy.origin == "lpv-nmpc" else None
         # Called with zero rows to trigger compilation here, not in the first control period.
-        self._network.act(np.zeros((0, self._size)), np.zeros((0, ACTIONS)))
+        none = observation_rows(np.zeros((0, self._size)), self._size)
+        self._network.act(none, np.zeros((0, ACTIONS)))
 
     def predict(
         self,
@@ -71,10 +73,15 @@ class LearnedPolicy:
         ------
         ValueError
             If the observation does not have this agent's layout.
+        TypeError
+            If `state` is not this agent's memory.
         """
         rows = observation_rows(observation, self._size)
         memory: Memory
         if self._base is None:
+            if not (state is None or isinstance(state, list)):
+                raise foreign(state)
+            started_rows(episode_start, len(rows))  # a check only
             memory, base = [None] * len(rows), np.zeros((len(rows), ACTIONS), dtype=np.float32)
         else:
             base, memory = self._base.predict(rows, state, episode_start, deterministic)  # type: ignore[arg-type]

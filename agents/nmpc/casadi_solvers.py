@@ -187,18 +187,18 @@ class _NlpSolver(ABC):
         one period here. Never raises: the status reports failures.
         """
         began = time.perf_counter()
+        parameters = self.problem.parameters(state, last_input, reference, weights)
+        if parameters is None:
+            return Solution(Status.NAN), None
         if warm is None:
             guess, solver = {"x0": self._cold_guess(state, last_input)}, self._cold_solver
         else:
             guess, solver = self._shifted(warm), self._warm_solver
-        parameters = np.concatenate([state, last_input, reference.ravel(), weights])
         return self._run(solver, guess, parameters, began)
 
     def _run(
         self, solver: ca.Function, guess: dict[str, Array], parameters: Array, began: float
     ) -> tuple[Solution, Any]:
-        if not np.isfinite(parameters).all():
-            return Solution(Status.NAN), None
         try:
             result = solver(p=parameters, **self._bounds, **guess)
             statistics = solver.stats()
@@ -319,7 +319,9 @@ class IpoptSolver(_NlpSolver):
             raise ValueError(f"there is no plan to start from: status {plan.status.value}")
         began = time.perf_counter()
         guess = {"x0": np.column_stack([plan.inputs, plan.slack, plan.states[1:]]).ravel()}
-        parameters = np.concatenate([state, last_input, reference.ravel(), weights])
+        parameters = self.problem.parameters(state, last_input, reference, weights)
+        if parameters is None:
+            return Solution(Status.NAN)
         return self._run(self._warm_solver, guess, parameters, began)[0]
 
     def _status(self, statistics: dict[str, Any]) -> Status:

@@ -63,7 +63,7 @@ class FrozenLpvSolver:
     ) -> tuple[Solution, Array | None]:
         """Solve as `RtiSolver.solve` does, with the frozen model."""
         began = time.perf_counter()
-        if not np.isfinite(np.concatenate([state, last_input, reference.ravel(), weights])).all():
+        if self.problem.parameters(state, last_input, reference, weights) is None:
             return Solution(Status.NAN), None
         low, high = self.problem.input_bounds
         last = np.clip(last_input, low, high)

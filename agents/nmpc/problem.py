@@ -35,8 +35,12 @@ RK4_STABILITY = 2.78
 """Largest product of step and pole for which classic Runge-Kutta is stable (real poles)."""
 
 
+LARGEST = 1e9
+"""Largest magnitude, in SI units, of a number that solves start from."""
+
+
 class Status(Enum):
-    """Result of a solve, in acados's vocabulary."""
+    """Result of a solve, in acados's vocabulary; NAN also for parameters beyond `LARGEST`."""
 
     SUCCESS = "SUCCESS"
     MAXITER = "MAXITER"
@@ -84,6 +88,28 @@ class NmpcProblem:
             raise ValueError(f"period must be positive, not {self.period} s")
         if min(*self.linear_penalty, *self.quadratic_penalty) < 0:
             raise ValueError("penalties must not be negative")
+
+    def parameters(
+        self, state: Array, last_input: Array, reference: Array, weights: Array
+    ) -> Array | None:
+        """Pack what a solve depends on into a vector; None if it is beyond all arithmetic.
+
+        That is the state (6,), the input in force (2,), the reference (N + 1, 4) and the weights
+        (10,), of which each number must be finite and at most `LARGEST`.
+
+        Raises
+        ------
+        ValueError
+            For another shape.
+        """
+        given = {"state": state, "last_input": last_input, "reference": reference,
+                 "weights": weights}  # fmt: skip
+        shapes = (STATES,), (INPUTS,), (self.horizon + 1, OUTPUTS), (2 * OUTPUTS + INPUTS,)
+        for (name, value), shape in zip(given.items(), shapes, strict=True):
+            if np.shape(value) != shape:
+                raise ValueError(f"{name} must have shape {shape}, not {np.shape(value)}")
+        packed = np.concatenate([np.ravel(value) for value in given.values()])
+        return packed if (np.abs(packed) <= LARGEST).all() else None  # NaN is not, either
 
     @property
     def substeps(self) -> int:

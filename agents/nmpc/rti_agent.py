@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.base import Action, DrivingTask, observation_rows
+from agents.base import Action, DrivingTask
+from agents.inputs import memory_of, observation_rows, started_rows
 from agents.nmpc import layout, qp, rti
 from agents.nmpc.base import Fallback, NmpcAgent, NmpcSettings
 from agents.nmpc.problem import INPUTS, STATES, Status
@@ -29,6 +30,7 @@ class RtiMemory:
     """
 
     def __init__(self, rows: int, horizon: int) -> None:
+        self.shape = (horizon,)
         self.plans = np.zeros((rows, horizon, INPUTS))
         self.flags = np.zeros((rows, rti.FLAGS), dtype=np.int64)
         self.stats = np.zeros((rows, qp.STATS))
@@ -126,11 +128,12 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         self._threads = checked_threads(threads)
         self._work = layout.working_space(self.problem.horizon, shares(self._threads))
         self._memory: RtiMemory | None = None
-        self._size = task.layout.size
         # Called with zero rows to trigger compilation here, not in the first control period.
-        memory, none = self._new(0), np.zeros((0, self._size))
-        self.switching.choose(none, self.problem.horizon, memory.bands, memory.weights)
-        self.solve_rows(none, self.fixed_weights, memory)
+        blank, none = self._new(0), np.zeros((0, self._size))
+        self._blank = blank
+        self.switching.choose(none, self.problem.horizon, blank.bands, blank.weights)
+        self.solve_rows(none, self.fixed_weights, blank)
+        observation_rows(none, self._size)
 
     def control(self, observation: TrackingObservation, memory: RtiRow) -> tuple[float, float]:
         """Compute inputs for one observation as `predict` does, with the memory of its row."""
@@ -164,17 +167,15 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         ------
         ValueError
             If the observation does not have this agent's layout.
+        TypeError
+            If `state` is not the memory of such an agent.
         """
         rows = observation_rows(observation, self._size)
-        # Not `batch_memory`: its mask takes a tenth of the time of a solve.
-        memory = self._memory if state is None else state
-        if memory is None or len(memory) != len(rows):
-            memory = self._new(len(rows))
+        memory = memory_of(state, self._memory, len(rows), self._blank, self._new)
         if state is None:
             self._memory = memory
-        if episode_start is not None and np.asarray(episode_start).any():
-            for row in np.flatnonzero(np.broadcast_to(episode_start, (len(rows),))).tolist():
-                memory.clear(row)
+        for row in started_rows(episode_start, len(rows)):
+            memory.clear(row)
         if self.has_schedule:
             self.switching.choose(rows, self.problem.horizon, memory.bands, memory.weights)
             weights = memory.weights
@@ -219,8 +220,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
                 age,
                 failures,
             )
-            a, delta = np.nan_to_num(action, nan=0.0).tolist()
-            rti.bound_action(a, delta, self.solver.constants, memory.actions[row])
+            rti.bound_action(*action, self.solver.constants, memory.actions[row])
 
     def diagnostics(self, memory: RtiRow) -> dict[str, Any]:
         """Describe the last solve of one vehicle, see `TrackingAgent.diagnostics`.

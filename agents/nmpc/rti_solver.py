@@ -237,8 +237,7 @@ class RtiSolver:
         status reports failures. The solution's cost is that of its predicted states.
         """
         began = time.perf_counter()
-        parameters = np.concatenate([state, last_input, reference.ravel(), weights])
-        if not np.isfinite(parameters).all():
+        if self.problem.parameters(state, last_input, reference, weights) is None:
             return Solution(Status.NAN), None
         n = self.problem.horizon
         low, high = self.problem.input_bounds

@@ -12,11 +12,11 @@ from agents.base import (
     CHECKPOINTS,
     Action,
     DrivingTask,
-    batch_memory,
     check_compatible,
-    observation_rows,
+    checked_task,
 )
 from agents.delay import NearFuture, moved_plan
+from agents.inputs import memory_of, observation_rows, started_rows
 from agents.nmpc import qp
 from agents.nmpc.rti_agent import RtiNmpc
 from agents.reference import NODE
@@ -80,7 +80,7 @@ class TunedNmpc:
         weights: str | Path | Mapping[str, Any] | Weights = "search",
         delay_compensation: bool | None = None,
     ) -> None:
-        self.task = task
+        self.task = checked_task(task)
         self.weights = _loaded(weights)
         policy = self.weights if isinstance(self.weights, WeightPolicy) else None
         if policy is not None:
@@ -104,7 +104,9 @@ class TunedNmpc:
         self._prepare: Callable[..., Any] | None = None
         self._finish: Callable[..., Any] | None = None
         # Called with zero rows to trigger compilation here, not in the first control period.
-        self._decide(np.zeros((0, task.layout.size), dtype=np.float32), self._new(0))
+        self._blank = self._new(0)
+        self._decide(np.zeros((0, task.layout.size), dtype=np.float32), self._blank)
+        observation_rows(np.zeros((0, task.layout.size)), task.layout.size)
 
     def __getstate__(self) -> dict[str, Any]:
         # Entries of compiled functions cannot be pickled; they are made anew where needed.
@@ -132,14 +134,18 @@ class TunedNmpc:
         ------
         ValueError
             If the observation does not have this agent's layout.
+        TypeError
+            If `state` is not the memory of such an agent.
         """
-        with np.errstate(over="ignore"):  # becomes infinite, which is handled as such
-            rows = observation_rows(observation, self.task.layout.size).astype(np.float32)
-        kept = self._memory if state is None else state
-        memory, starts = batch_memory(kept, len(rows), episode_start, self._new)
+        rows = observation_rows(observation, self.task.layout.size).astype(np.float32)
+        kept = self._memory
+        memory = memory_of(state, kept, len(rows), self._blank, self._new)
+        started = started_rows(episode_start, len(rows))
         if state is None:
             self._memory = memory
-        for row in np.flatnonzero(starts).tolist():
+        if memory is not state and memory is not kept:
+            started = list(range(len(rows)))
+        for row in started:
             memory.clear(row, rows[row])
         self._decide(rows, memory)
         actions = memory.nmpc.actions.astype(np.float32)

@@ -70,6 +70,7 @@ class LoopMemory:
         self.history = np.zeros((rows, HISTORY))
         self.tables = np.tile(sets, (rows, 1, 1))
         """Weights of each band that a weight policy has chosen, (n, bands, 10)."""
+        self.shape = (horizon, size, self.commands.shape[1], *self.tables.shape[1:])
         self._delays = np.zeros(0) if future is None else future.settings
         self._sets = sets
 

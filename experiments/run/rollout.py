@@ -1,6 +1,8 @@
 """Rollouts: an agent drives an environment for an episode, which is recorded as a trace."""
 
+import math
 import time
+import warnings
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, fields
 from typing import Any
@@ -10,10 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents import Agent
+from agents.base import DrivingTask, blind_control
 from lpv_track_env.bicycle import STATE_SIZE
+from lpv_track_env.validation import two_numbers
 from trajectories import ReferencePath
 
 Array = NDArray[np.float64]
+
+NOT_FINITE = "not finite"
+"""Name, among the fallbacks, of the controlled stop in place of an action that is not finite."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +66,8 @@ class Rollout:
     statuses: dict[str, int]
     """Solves by status, empty for agents that solve nothing."""
     fallbacks: dict[str, int]
-    """Number of steps in which a fallback replaced a failed solve, by its name."""
+    """Number of steps in which a fallback replaced a failed solve, by its name; `NOT_FINITE` counts
+    controlled stops in place of actions."""
     solver_seconds: Array
     """Time inside the solver, (n,) s; empty for agents that solve nothing."""
     iterations: Array
@@ -104,7 +112,8 @@ def steps(
     the observation before the step under "observation". `computing_time(k, seconds)` receives the
     duration of the agent's call and returns the times (s, s) until the action of step k takes
     effect and until the next may be computed, see `PathTrackingEnv.set_computing_time`. While the
-    agent is busy with an earlier action it computes no new one; its `solve_time` is 0 there.
+    agent is busy with an earlier action it computes no new one; its `solve_time` is 0 there. A
+    controlled stop replaces an action that is not finite; a warning says how many there were.
     """
     observation, info = env.reset(seed=seed, options=options)
     inner: Any = env.unwrapped
@@ -142,14 +151,13 @@ def steps(
     iterations: list[int] = []
     slack = np.zeros(3)
     explain, hold = getattr(agent, "diagnostics", None), getattr(agent, "hold", None)
+    driver = _Driver(env, agent)
     done = False
     while not done:
         computed = not inner.controller_busy
         seconds = 0.0
         if computed:
-            began = time.perf_counter()
-            action, memory = agent.predict(observation, memory, episode_start=start)
-            seconds = time.perf_counter() - began
+            action, memory, seconds = driver.predict(observation, memory, start)
         elif hold is not None:
             hold(memory)
         start = np.array([False])
@@ -169,6 +177,7 @@ def steps(
             if solve["slack"] is not None:
                 slack = np.maximum(slack, solve["slack"])
         yield len(rows) - 1, {**info, "agent": solve, "observation": before}
+    driver.tell(fallbacks, len(rows) - 1)
     table = np.array(rows).T
     trace = Trace(
         period * np.arange(len(rows)),
@@ -187,3 +196,43 @@ def steps(
         iterations=np.array(iterations, dtype=float),
         slack=slack,
     )
+
+
+class _Driver:
+    """An agent's calls, timed; controlled stops replace actions that are not finite.
+
+    A `TrackingAgent` makes and counts these stops itself.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], agent: Agent) -> None:
+        self._env, self._agent = env, agent
+        self._count = -self._by_agent
+
+    @property
+    def _by_agent(self) -> int:
+        count: int = getattr(self._agent, "replaced_actions", 0)
+        return count
+
+    def predict(self, observation: Any, memory: Any, start: Any) -> tuple[Any, Any, float]:
+        """Return an action, the agent's memory, and the time that its call took, s."""
+        began = time.perf_counter()
+        action, memory = self._agent.predict(observation, memory, episode_start=start)
+        seconds = time.perf_counter() - began
+        if not all(map(math.isfinite, two_numbers(action))):
+            self._count += 1
+            task = DrivingTask.of(self._env)
+            seen = task.layout.unpack(task.layout.tracking_part(observation))
+            action = np.array(blind_control(task.vehicle, seen), dtype=np.float32)
+        return action, memory, seconds
+
+    def tell(self, fallbacks: dict[str, int], steps: int) -> None:
+        """Add the number of stops to the fallbacks, and warn of them, if there are any."""
+        stops = self._count + self._by_agent
+        if stops == 0:
+            return
+        fallbacks[NOT_FINITE] = stops
+        warnings.warn(
+            f"{stops} of {steps} actions were not finite, controlled stops replaced them",
+            UserWarning,
+            stacklevel=3,
+        )

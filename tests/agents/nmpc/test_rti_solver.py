@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from agents.nmpc.casadi_solvers import IpoptSolver
-from agents.nmpc.problem import NmpcProblem, Solution, Status
+from agents.nmpc.problem import LARGEST, NmpcProblem, Solution, Status
 from agents.nmpc.rti_solver import RtiSolver
 from experiments.verify.bench import scaled_error
 from experiments.verify.oracles import plan_cost, rolled_out
@@ -216,7 +216,8 @@ def test_absurd_parameters_end_in_a_status(place: int, iterations: int) -> None:
             assert (low <= solved(solution)[0]).all()
             assert (solved(solution)[0] <= high).all()
         else:
-            assert solution.status in {Status.MAXITER, Status.QP_FAILURE}
+            failed = {Status.NAN} if size > LARGEST else {Status.MAXITER, Status.QP_FAILURE}
+            assert solution.status in failed
             assert solution.inputs is None
             assert warm is None
     assert solver.solve(*case.parameters)[0].status is Status.SUCCESS
@@ -226,7 +227,7 @@ def test_a_failed_solve_leaves_no_trace() -> None:
     problem = NmpcProblem(COURSE_CAR)
     used, fresh = RtiSolver(problem), RtiSolver(problem)
     case, other = cases(2, problem)
-    used.solve(other.state * 1e200, *other.parameters[1:])
+    used.solve(other.state * 1e6, *other.parameters[1:])
     one, two = used.solve(*case.parameters)[0], fresh.solve(*case.parameters)[0]
     np.testing.assert_array_equal(solved(one)[0], solved(two)[0])
     assert one.cost == two.cost
