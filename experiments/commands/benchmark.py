@@ -43,6 +43,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shared.add_out(parser, "results/benchmark")
     shared.add_workers(parser)
     parser.add_argument(
+        "--case-limit", type=float, metavar="S",
+        help="a case that takes longer has failed, s (default 1800). With --workers 1 it cannot "
+        "end an agent that is stuck in native code",
+    )  # fmt: skip
+    parser.add_argument(
         "--resume", action="store_true", help="keep the cases that DIR holds already"
     )
 
@@ -50,7 +55,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the cases, print the tables, write the report; return 1 if a case failed, else 0."""
     from experiments.run import suites
-    from experiments.run.benchmark import distinct, run_benchmark, selected
+    from experiments.run.benchmark import CASE_LIMIT, distinct, run_benchmark, selected
     from trajectories.naming import choose
 
     seeds = shared.seeds_of(options)
@@ -87,6 +92,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         store = run_benchmark(
             specs, options.out, workers=options.workers, settings=settings,
             resume=options.resume, console=console,
+            limit=CASE_LIMIT if options.case_limit is None else options.case_limit,
         )  # fmt: skip
     return finish(store, selected(store, specs), console)
 
@@ -94,12 +100,15 @@ def run(options: argparse.Namespace, console: Console) -> int:
 def finish(store: "ResultStore", cases: Sequence[Mapping[str, Any]], console: Console) -> int:
     """Print tables, write the report, say where the rest is; return 1 if a case failed, else 0."""
     from experiments.report.build import where, write_report
+    from experiments.report.drives import NamedFiles
     from experiments.run.benchmark import print_failed
     from experiments.run.console_tables import screen
 
     tables, complete = screen(cases)
     console.print(tables)
-    report = write_report(store.folder)
+    # The files that were just driven with; the folder may name others.
+    named = {str(case.get(key)) for case in cases for key in ("trajectory", "vehicle")}
+    report = write_report(store.folder, NamedFiles(frozenset(named)))
     failed = print_failed(cases, console)
     lines = [where(report)]
     if not complete:

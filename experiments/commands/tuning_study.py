@@ -77,8 +77,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from experiments.study.study import run_evaluations, run_trainings
 
     study = study_of(options)
-    study.claim()
-    with resumable(options, console), progress_bar(console) as progress:
+    with study.claimed(), resumable(options, console), progress_bar(console) as progress:
 
         def follow(words: str, steps: Iterator[tuple[int, int]]) -> None:
             bar = progress.add_task(words, total=None)

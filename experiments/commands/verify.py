@@ -154,7 +154,7 @@ def _measure(
     running = (
         engines.in_process(specs, run_situation)
         if workers == 1
-        else engines.local_pool(specs, workers, run_situation, died=situation_death)
+        else engines.local_pool(specs, workers, run_situation, failed=situation_death)
     )
     results = []
     with progress_bar(console) as progress:

@@ -13,23 +13,31 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Required, TypedDict
 
 import trajectories
 from experiments.run.engines import Interrupts
+from experiments.run.folder_lock import locked
 from experiments.run.provenance import file_digest
 from experiments.run.suites import HELD_OUT, SIX
 from trajectories import ReferencePath
-from trajectories.fileio import write_atomically
-
-try:
-    import fcntl
-except ImportError:  # Windows has no such locks: two jobs in one folder are not refused there
-    fcntl = None  # type: ignore[assignment]
+from trajectories.fileio import checked, parse_json, read_bytes, read_json, write_atomically
 
 SETTINGS, PROGRESS = "settings.json", "progress.jsonl"
 
 Line = dict[str, Any]
+
+
+class ProgressLine(TypedDict, total=False):
+    """Entries of a progress line that are read again; there may be further ones."""
+
+    seconds: Required[float]
+    learning_seconds: float
+    steps: int
+    solves: int
+    score: float
+    best: bool | float
+    validation: dict[str, float]
 
 
 class Settings(Protocol):
@@ -129,32 +137,11 @@ def claimed(folder: Path, settings: Settings, kind: str) -> Iterator[bool]:
     ValueError
         If another process uses the folder, or it holds a job with other settings.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
         stored = stored_settings(folder, kind)
         if stored is not None and (differs := difference(settings, stored)):
             raise ValueError(f"{folder} holds a {kind} with other settings: {differs}")
         yield stored is not None
-
-
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Lock a folder for as long as this process lives, however it ends.
-
-    Raises
-    ------
-    ValueError
-        If another process holds the lock.
-    """
-    with (folder / ".lock").open("w") as handle:
-        if fcntl is not None:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ValueError(
-                    f"another process trains in {folder}: wait for it, or give another --out"
-                ) from None
-        yield
 
 
 def stored_settings(folder: Path, kind: str) -> Mapping[str, Any] | None:
@@ -169,12 +156,9 @@ def stored_settings(folder: Path, kind: str) -> Mapping[str, Any] | None:
     if not file.exists():
         return None
     try:
-        content: dict[str, Any] = json.loads(file.read_text())
-        if not isinstance(content, dict):
-            raise TypeError(f"{SETTINGS} holds no settings")
-    except (OSError, TypeError, ValueError) as error:
+        return checked(read_json(file), dict[str, Any], file)
+    except ValueError as error:
         raise ValueError(f"{folder} holds no {kind} to go on with: {error}") from None
-    return content
 
 
 def write_settings(folder: Path, settings: Settings) -> None:
@@ -198,8 +182,20 @@ def plain_values(settings: Any, named: Iterable[str]) -> dict[str, Any]:
 
 
 def read_lines(folder: Path) -> list[Line]:
-    """Read the lines of a folder's `progress.jsonl`."""
-    return [json.loads(line) for line in (folder / PROGRESS).read_text().splitlines()]
+    """Read the lines of a folder's `progress.jsonl`.
+
+    Raises
+    ------
+    ValueError
+        In one line that names the file and line, for one that is no progress line.
+    """
+    file = folder / PROGRESS
+    lines = []
+    for number, text in enumerate(read_bytes(file).splitlines(), start=1):
+        line = parse_json(text, name := f"{file}, line {number}")
+        checked(line, ProgressLine, name)
+        lines.append(line)
+    return lines
 
 
 def _write_lines(folder: Path, lines: Sequence[Line]) -> None:

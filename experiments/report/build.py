@@ -9,11 +9,12 @@ from experiments.report import drive_replay
 from experiments.report.agent_comparison import comparison_section, curvature_section
 from experiments.report.cost import computing_section, learning_section
 from experiments.report.drive_figures import figure_sections
-from experiments.report.drives import drives_of, in_families
+from experiments.report.drives import NO_FILES, NamedFiles, drives_of, in_families
 from experiments.report.page import Document, html_table, joined, line_styles, paragraph
 from experiments.report.sideslip import sideslip_section
 from experiments.report.summary import failures_section, summary_section
 from experiments.run import tables
+from experiments.run.result_schema import read_driven
 from experiments.run.store import ResultStore
 from experiments.run.tables import Result
 from trajectories.fileio import write_atomically
@@ -52,27 +53,43 @@ ERRATA = (
     ),
 )
 """Points where kumar2025lpv contradicts itself or leaves something out, and our reading."""
+SHOWN = 5
+"""Number of messages and of files that a note names."""
 LONGEST_LIST = 24
 """Number of entries of a list that are shown."""
 
 
-def write_report(folder: Path) -> Path:
+def write_report(
+    folder: Path, files: NamedFiles = NO_FILES, skipped: list[str] | None = None
+) -> Path:
     """Build `report.html` in a results folder from what the folder holds, and return its path.
+
+    Lines of `cases.jsonl` that cannot be read are left out; the page says so.
+
+    Parameters
+    ----------
+    folder
+        The results.
+    files
+        Files of paths and vehicles that the cases name and that may be opened.
+    skipped
+        Receives a message for each line that is left out.
 
     Raises
     ------
     ValueError
-        If the folder holds no cases, or a damaged line other than the last.
+        If the folder holds no cases that can be read.
     """
     none = f"no results in {folder}: run lpv-track benchmark --out {folder} first"
     if not (folder / "cases.jsonl").is_file():
         raise ValueError(none)
     store = ResultStore(folder)
-    cases = store.cases()
+    skipped = [] if skipped is None else skipped
+    cases = store.cases(skipped, read_driven)
     if not cases:
-        raise ValueError(none)
+        raise ValueError(skipped[0] if skipped else none)
     file = folder / "report.html"
-    write_atomically(file, build(cases, store).encode())
+    write_atomically(file, build(cases, store, files, skipped).encode())
     return file
 
 
@@ -81,15 +98,19 @@ def where(report: Path) -> str:
     return f"report: {report} ({report.stat().st_size / 1e6:.1f} MB)"
 
 
-def build(cases: Sequence[Result], store: ResultStore) -> str:
-    """Return the page as text."""
+def build(
+    cases: Sequence[Result], store: ResultStore, files: NamedFiles, skipped: Sequence[str]
+) -> str:
+    """Return the page as text; `skipped` are messages on lines that could not be read."""
     kept = in_families(tables.ordered(tables.current(cases)))
     rows = tables.build_rows(kept)
     manifest = store.manifest()
-    drives, missing = drives_of(kept, store)
+    drives, missing = drives_of(kept, store, files)
     styles = line_styles(tables.labels(kept))
     document = Document()
-    document.section("Summary", summary_section(document, kept, len(cases) - len(kept)))
+    notes = joined([skipped_note(skipped), closed_note(kept, files)])
+    summary = summary_section(document, kept, len(cases) - len(kept))
+    document.section("Summary", joined([notes, summary]))
     figure_sections(document, drives, missing, styles)
     document.section("Replay", drive_replay.replay_section(drives), printed=False)
     document.section("Against the published table", comparison_section(document, kept, rows))
@@ -105,6 +126,30 @@ def build(cases: Sequence[Result], store: ResultStore) -> str:
     document.section("Settings and provenance", manifest_section(document, manifest, kept))
     scripts = (drive_replay.SCRIPT,) if drives else ()
     return document.render("Path tracking benchmark", subtitle(manifest), scripts)
+
+
+def skipped_note(skipped: Sequence[str]) -> str:
+    """Return a paragraph on lines of `cases.jsonl` that could not be read; "" without any."""
+    if not skipped:
+        return ""
+    rest = f" … and {len(skipped) - SHOWN} more" if len(skipped) > SHOWN else ""
+    lines = "; ".join(skipped[:SHOWN])
+    return paragraph(f"Left out, because they cannot be read: {lines}{rest}.", "bad")
+
+
+def closed_note(cases: Sequence[Result], files: NamedFiles) -> str:
+    """Return a paragraph on the files that cases name and that were not opened; "" without any."""
+    paths = {name for case in cases if files.closed_path(name := str(case.get("trajectory")))}
+    cars = {name for case in cases if files.closed_vehicle(name := str(case.get("vehicle", "")))}
+    closed = sorted(paths | cars)
+    if not closed:
+        return ""
+    rest = f" … and {len(closed) - SHOWN} more" if len(closed) > SHOWN else ""
+    return paragraph(
+        f"Files that the cases name were not opened: {', '.join(closed[:SHOWN])}{rest}. Paths are "
+        "drawn as far as they were driven, and vehicles in a usual size. If you trust the results, "
+        "lpv-track report --open-named-files reads them.", "soft"
+    )  # fmt: skip
 
 
 def subtitle(manifest: Mapping[str, Any]) -> str:
@@ -130,6 +175,14 @@ def manifest_section(
 ) -> str:
     """Return command, settings, revision, versions, hardware and seeds."""
     parts = []
+    keys = sorted({str(case["manifest"]) for case in cases if "manifest" in case})
+    if len(keys) > 1:
+        parts.append(
+            paragraph(
+                f"Computed with {len(keys)} different sets of versions ({', '.join(keys)}), so "
+                "that last digits may differ: see the files manifest-….json.", "bad"
+            )
+        )  # fmt: skip
     command = manifest.get("command")
     if isinstance(command, list):
         parts.append(f'<pre tabindex="0">{html.escape(" ".join(map(str, command)))}</pre>')

@@ -14,7 +14,6 @@ from experiments.report.drives import (
     by_trajectory,
     families,
     family_of,
-    plant,
     reference_line,
 )
 from experiments.report.page import joined, paragraph
@@ -62,7 +61,7 @@ def moments(drive: Drive) -> dict[str, Any]:
         "steering": trace["steering_angle"], "acceleration": trace["acceleration"],
         "lateral": trace["lateral_error"], "heading": trace["heading_error"],
     }  # fmt: skip
-    car = plant(case)
+    car = drive.car
     body = BODY
     if car is not None:
         body = car.length, car.width, car.front_axle_distance, car.rear_axle_distance

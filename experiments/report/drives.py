@@ -1,5 +1,6 @@
 """Drives that a report draws: cases with their traces, grouped by setting and by conditions."""
 
+import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -14,8 +15,8 @@ from experiments.run import tables
 from experiments.run.store import ResultStore
 from experiments.run.tables import Result, Setting
 from lpv_track_env import vehicle
-from lpv_track_env.bicycle import PSI, X, Y
-from lpv_track_env.vehicle import VehicleParameters
+from lpv_track_env.bicycle import PSI, STATE_SIZE, X, Y
+from lpv_track_env.vehicle import VEHICLES, VehicleParameters
 from trajectories import ReferencePath
 
 Array = NDArray[np.float64]
@@ -28,6 +29,47 @@ TRACE = (
 """Arrays that a trace must hold to be drawn."""
 LEAD = "lpv-nmpc"
 """Agent whose figures come first, if it has driven."""
+RANDOM = re.compile(r"random-(fast-)?\d{1,18}")
+"""Names of random paths."""
+
+
+@dataclass(frozen=True)
+class NamedFiles:
+    """Files of paths and vehicles that cases name, as far as a report may open them.
+
+    A results folder may come from somebody else, so that a report opens no file by itself.
+
+    Parameters
+    ----------
+    opened
+        Names of files that may be opened; None for all.
+    """
+
+    opened: frozenset[str] | None = frozenset()
+
+    def path(self, trajectory: str) -> ReferencePath | None:
+        """Return the path of a name or file; None if it cannot be loaded or may not be opened."""
+        return None if self.closed_path(trajectory) else reference_path(trajectory)
+
+    def car(self, case: Result) -> VehicleParameters | None:
+        """Return the vehicle of a case; None if it cannot be loaded or may not be opened."""
+        return None if self.closed_vehicle(str(case.get("vehicle"))) else plant(case)
+
+    def closed_path(self, trajectory: str) -> bool:
+        """Return whether a trajectory is a file that may not be opened."""
+        named = trajectory in trajectories.names() or RANDOM.fullmatch(trajectory) is not None
+        return not named and not self._may_open(trajectory)
+
+    def closed_vehicle(self, vehicle: str) -> bool:
+        """Return whether a vehicle is a file that may not be opened."""
+        return vehicle not in VEHICLES and not self._may_open(vehicle)
+
+    def _may_open(self, name: str) -> bool:
+        return self.opened is None or name in self.opened
+
+
+NO_FILES = NamedFiles()
+"""Nothing may be opened."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +80,17 @@ class Drive:
     trajectory: str
     case: Result
     trace: Mapping[str, Array]
+    files: NamedFiles = NO_FILES
+
+    @property
+    def path(self) -> ReferencePath | None:
+        """Its path, or None if it cannot be loaded or may not be opened."""
+        return self.files.path(self.trajectory)
+
+    @property
+    def car(self) -> VehicleParameters | None:
+        """Its vehicle, or None if it cannot be loaded or may not be opened."""
+        return self.files.car(self.case)
 
     @property
     def finished(self) -> bool:
@@ -78,17 +131,31 @@ class Family:
 
 
 def usable(trace: Mapping[str, Array] | None) -> bool:
-    """Return whether a trace holds all arrays of `TRACE`, finite and of one length."""
+    """Return whether a trace holds all arrays of `TRACE`, finite, of one length, in time's order.
+
+    `state` is (n, 6), the others are (n,), n > 1.
+    """
     if not trace or any(name not in trace for name in TRACE):
         return False
-    n = len(trace["time"])
-    return n > 1 and all(
-        len(trace[name]) == n and bool(np.isfinite(trace[name]).all()) for name in TRACE
+    n = trace["time"].size
+    return (
+        n > 1
+        and all(
+            trace[name].shape == ((n, STATE_SIZE) if name == "state" else (n,))
+            and bool(np.isfinite(trace[name]).all())
+            for name in TRACE
+        )
+        and bool((np.diff(trace["time"]) > 0.0).all())
     )
 
 
-def drives_of(cases: Iterable[Result], store: ResultStore) -> tuple[list[Drive], list[Result]]:
-    """Return the first seed's drive of every agent, setting and path, and cases without a trace."""
+def drives_of(
+    cases: Iterable[Result], store: ResultStore, files: NamedFiles = NO_FILES
+) -> tuple[list[Drive], list[Result]]:
+    """Return the first seed's drive of every agent, setting and path, and cases without a trace.
+
+    `files` says which files of paths and vehicles may be opened.
+    """
     drives: dict[tuple[Setting, str, str], Drive] = {}
     missing: list[Result] = []
     for case in cases:
@@ -100,7 +167,7 @@ def drives_of(cases: Iterable[Result], store: ResultStore) -> tuple[list[Drive],
         if trace is None or not usable(trace):
             missing.append(case)
             continue
-        drives[key] = Drive(label, path, case, trace)
+        drives[key] = Drive(label, path, case, trace, files)
     return list(drives.values()), missing
 
 
@@ -182,7 +249,7 @@ def longest_trace(drives: Sequence[Drive]) -> Mapping[str, Array]:
 
 def reference_line(drives: Sequence[Drive]) -> tuple[Array, Array]:
     """Return X and Y (m) of a trajectory, or of the driven part of it if it cannot be loaded."""
-    path = reference_path(drives[0].trajectory)
+    path = drives[0].path
     if path is not None:
         return path.x, path.y
     x, y, _ = foot_points(longest_trace(drives))

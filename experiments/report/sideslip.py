@@ -11,8 +11,6 @@ from experiments.report.drives import (
     Drive,
     by_setting,
     by_trajectory,
-    plant,
-    reference_path,
 )
 from experiments.report.page import (
     Document,
@@ -62,7 +60,7 @@ def required_sideslip(drive: Drive) -> tuple[Array, Array] | None:
 
     None if the path or the vehicle cannot be loaded.
     """
-    path, car = reference_path(drive.trajectory), plant(drive.case)
+    path, car = drive.path, drive.car
     if path is None or car is None:
         return None
     reach = drive.trace["arc_length"]
@@ -91,7 +89,7 @@ def sideslip_section(
             "published errors (MLE 0.7 to 1.6 m, MOE 0.3 to 0.6 rad) are consistent with that."
         )
     ]
-    if limits := _limits(cases):
+    if limits := _limits(drives):
         lines = [[name, f"{limit:.2f}", f"{limit / lever:.3f}"] for name, limit, lever in limits]
         headings = ("vehicle", "limit on |vy|/vx", "curvature limit at low speed, 1/m")
         parts.append(document.table("What the limit allows.", html_table(headings, lines, (1, 2))))
@@ -121,13 +119,17 @@ def sideslip_section(
     return joined(parts)
 
 
-def _limits(cases: Iterable[Result]) -> list[tuple[str, float, float]]:
+def _limits(drives: Iterable[Drive]) -> list[tuple[str, float, float]]:
     """Return name, limit on |vy|/vx and lr of every vehicle that can be loaded."""
     found: dict[tuple[str, float, float], None] = {}
-    for case in cases:
-        car = plant(case)
+    for drive in drives:
+        car = drive.car
         if car is not None:
-            key = str(case.get("vehicle")), car.max_lateral_velocity_ratio, car.rear_axle_distance
+            key = (
+                str(drive.case.get("vehicle")),
+                car.max_lateral_velocity_ratio,
+                car.rear_axle_distance,
+            )
             found[key] = None
     return sorted(found)
 
@@ -158,7 +160,7 @@ def _reached(cases: Iterable[Result], drives: Mapping[Any, Drive]) -> str:
 
 
 def _lengths(drive: Drive) -> tuple[str, str]:
-    car, needed = plant(drive.case), required_sideslip(drive)
+    car, needed = drive.car, required_sideslip(drive)
     if car is None:
         return "–", "–"
     limit = car.max_lateral_velocity_ratio
@@ -177,7 +179,7 @@ def _panels(drives: Sequence[Drive], styles: Styles) -> list[Panel]:
 
 
 def _limit(drives: Sequence[Drive]) -> float:
-    car = plant(drives[0].case)
+    car = drives[0].car
     return USUAL if car is None else car.max_lateral_velocity_ratio
 
 

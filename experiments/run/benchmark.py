@@ -1,5 +1,6 @@
 """Runs of many cases: those that a folder of results lacks are run, with progress."""
 
+import json
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -18,8 +19,10 @@ from rich.progress import (
 )
 
 from experiments.run import engines
-from experiments.run.case import BaseCase, Case, run_case, worker_death
+from experiments.run.case import BaseCase, Case, failed_case, run_case
 from experiments.run.engines import Interrupts
+from experiments.run.folder_lock import locked
+from experiments.run.provenance import version_changes
 from experiments.run.store import ResultStore
 from experiments.run.tables import path_name
 
@@ -27,6 +30,8 @@ Spec = Mapping[str, Any]
 
 STEPS = 20
 """Most lines of progress where the console is no terminal."""
+CASE_LIMIT = 1800.0
+"""Time limit of a case, s: the slowest agent, IPOPT's, takes some minutes on a busy computer."""
 
 
 def distinct(specs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -43,35 +48,90 @@ def run_benchmark(
     console: Console,
     resume: bool = True,
     kind: type[BaseCase] = Case,
+    limit: float = CASE_LIMIT,
 ) -> ResultStore:
     """Run the cases that the folder does not hold yet, and store each as it ends.
 
-    `specs` are the fields of cases of the class `kind`, `settings` entries of the manifest.
+    Lines of `cases.jsonl` that cannot be read are named and left alone; their cases are run again.
+
+    Parameters
+    ----------
+    specs
+        Fields of cases of the class `kind`.
+    folder
+        Folder of results, made if need be; locked meanwhile.
+    workers
+        Number of processes; 1: this one.
+    settings
+        Entries of the manifest.
+    console
+        Receives the progress.
+    resume
+        Allow a folder that holds results already.
+    kind
+        Class of the cases.
+    limit
+        Time limit of a case, s: one that takes longer has failed. With one worker, an agent that
+        never returns from native code is not ended, see `experiments.run.engines.TimeLimit`.
 
     Raises
     ------
     ValueError
-        For an unknown name, no workers, or a folder that holds results while `resume` is off.
+        For an unknown name, no workers, a limit that is not positive, a folder that another process
+        writes in, or one that holds results while `resume` is off.
     """
     if workers < 1:
         raise ValueError(f"workers must be at least 1, not {workers}")
+    if not limit > 0.0:
+        raise ValueError(f"the time limit of a case must be positive, not {limit:g} s")
+    by_id = {}
     for spec in specs:
-        kind(**spec).check()
-    by_id = {kind(**spec).id: spec for spec in specs}
-    store = ResultStore(folder)
-    known = {case["id"] for case in store.cases() if case["status"] == "ok"}
-    if store.cases() and not resume:
-        raise ValueError(f"{folder} holds results already: say --resume, or give another --out")
-    missing = [spec for key, spec in by_id.items() if key not in known]
-    store.write_manifest({**settings, "cases": list(by_id)})
-    if len(missing) < len(by_id):
-        console.print(
-            f"{len(by_id) - len(missing)} of {len(by_id)} cases are in {folder} already "
-            "(same sources, same settings)"
-        )
-    if missing:
-        _run(missing, kind, store, min(workers, len(missing)), console)
+        case = kind(**spec)
+        case.check()
+        # Whatever goes wrong in it, the case's result can be stored.
+        by_id[failed_case(spec, "", kind)["id"]] = case.as_dict()
+    with locked(folder):
+        store = ResultStore(folder)
+        skipped: list[str] = []
+        held = store.cases(skipped)
+        if (held or skipped) and not resume:
+            raise ValueError(f"{folder} holds results already: say --resume, or give another --out")
+        known = {case["id"] for case in held if case["status"] == "ok"}
+        missing = {key: spec for key, spec in by_id.items() if key not in known}
+        notes = [f"skipped: {line}" for line in skipped]
+        if len(missing) < len(by_id):
+            notes.append(
+                f"{len(by_id) - len(missing)} of {len(by_id)} cases are in {folder} already "
+                "(same sources, same settings)"
+            )
+        if older := _computed_before(missing, held, kind):
+            changes = ", ".join(version_changes(store.manifest())) or "other sources"
+            notes.append(
+                f"{older} of {len(by_id)} cases are run anew: those in {folder} were made with "
+                f"{changes}"
+            )
+        for note in notes:
+            console.print(note, markup=False, highlight=False)
+        store.write_manifest({**settings, "cases": list(by_id)})
+        if missing:
+            _run(list(missing.values()), kind, store, workers, console, limit)
     return store
+
+
+def _computed_before(
+    missing: Mapping[str, Spec], held: Sequence[Mapping[str, Any]], kind: type[BaseCase]
+) -> int:
+    """Return how many of the missing cases a folder holds with another id, computed otherwise."""
+    if not missing or not held:
+        return 0
+    wanted = {json.dumps(kind(**spec).as_dict(), sort_keys=True) for spec in missing.values()}
+    names = list(kind(**next(iter(missing.values()))).as_dict())
+    there = {
+        json.dumps({name: case.get(name) for name in names}, sort_keys=True)
+        for case in held
+        if case["status"] == "ok"
+    }
+    return len(wanted & there)
 
 
 def progress_bar(console: Console) -> Progress:
@@ -90,8 +150,9 @@ def progress_bar(console: Console) -> Progress:
 
 
 def _run(
-    specs: Sequence[Spec], kind: type[BaseCase], store: ResultStore, workers: int, console: Console
-) -> None:
+    specs: Sequence[Spec], kind: type[BaseCase], store: ResultStore, workers: int,
+    console: Console, limit: float,
+) -> None:  # fmt: skip
     progress = progress_bar(console)
     began = time.perf_counter()
     with progress, Interrupts() as interrupts:
@@ -100,11 +161,12 @@ def _run(
         def started(spec: Spec) -> None:
             progress.update(bar, description=label(spec))
 
-        run, died = (partial(function, kind=kind) for function in (run_case, worker_death))
+        run, failed = partial(run_case, kind=kind), partial(failed_case, kind=kind)
+        # Also for a single case: only from another process can native code be ended.
         results = (
-            engines.in_process(specs, run, started)
+            engines.in_process(specs, run, started, failed, limit)
             if workers == 1
-            else engines.local_pool(specs, workers, run, started, died)
+            else engines.local_pool(specs, workers, run, started, failed, limit)
         )
         for count, result in enumerate(results, start=1):
             # Before the result is stored: a case may have taken Ctrl-C for a failed solve.
@@ -134,7 +196,7 @@ def selected(
     store: ResultStore, specs: Sequence[Spec], kind: type[BaseCase] = Case
 ) -> list[dict[str, Any]]:
     """Return the results of some specs, in their order."""
-    by_id = {case["id"]: case for case in store.cases()}
+    by_id = {case["id"]: case for case in store.cases([])}
     return [by_id[key] for spec in specs if (key := kind(**spec).id) in by_id]
 
 

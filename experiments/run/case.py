@@ -3,6 +3,7 @@
 import hashlib
 import inspect
 import json
+import signal
 import time
 import warnings
 from abc import ABC, abstractmethod
@@ -23,7 +24,14 @@ from agents.registry import check_settings, source_file
 from agents.weights import weights_from
 from experiments.run import learning_cost, metrics
 from experiments.run.computing import ComputingTimes
-from experiments.run.provenance import file_digest
+from experiments.run.provenance import (
+    COMPUTING,
+    OPTIONAL,
+    computing_versions,
+    file_digest,
+    manifest_key,
+)
+from experiments.run.result_schema import as_stored
 from experiments.run.rollout import Rollout, rollout
 from lpv_track_env import conditions, plants, vehicle
 from lpv_track_env.env import PathTrackingEnv
@@ -31,10 +39,13 @@ from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import SPEED_MODES
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.compilation import source_digest
+from trajectories.fileio import shortened
 from trajectories.naming import choose
 
 VEHICLE_FIELDS = tuple(field.name for field in fields(VehicleParameters))
 REWARD_FIELDS = tuple(field.name for field in fields(RewardWeights))
+LONGEST_MESSAGE = 1000
+"""Most characters of an error or warning in a result."""
 
 
 def keyword_settings(function: Callable[..., Any]) -> tuple[str, ...]:
@@ -61,12 +72,21 @@ class BaseCase(ABC):
 
     @property
     def id(self) -> str:
-        """Hash of the case, of the files it names and of the project's sources."""
+        """Hash of the case, the files it names, the project's sources and the packages' versions.
+
+        Other versions of NumPy or Numba change the last digits of a result, as other sources may.
+        """
         digests = [
             file_digest(file) for file in self.files() if file is not None and file.is_file()
         ]
-        content = json.dumps([self.as_dict(), digests, project_digest()], sort_keys=True)
+        versions = computing_versions(*self.packages())
+        content = json.dumps([self.as_dict(), digests, project_digest(), versions], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+    def packages(self) -> tuple[str, ...]:
+        """Return the packages that compute a result; a user's own agent may use any of them."""
+        own = self.agent not in agents.names() and not self.agent.endswith(".json")
+        return (*COMPUTING, *(OPTIONAL if own else ()))
 
     def files(self) -> list[Path | None]:
         """Return the files whose contents a result depends on, beside the project's sources."""
@@ -118,6 +138,7 @@ class BaseCase(ABC):
             "solver": {},
             "warnings": [],
             "seconds": 0.0,
+            "manifest": manifest_key(),
             "trace": {},
         }
 
@@ -181,6 +202,11 @@ class Case(BaseCase):
             choose("vehicle field", key, VEHICLE_FIELDS)
         plants.make(self.env_settings.get("plant", plants.BICYCLE), self.make_vehicle())
 
+    def packages(self) -> tuple[str, ...]:
+        """Return the packages that compute a result."""
+        independent = self.env_settings.get("plant", plants.BICYCLE) != plants.BICYCLE
+        return (*super().packages(), *(("commonroad-vehicle-models",) if independent else ()))
+
     def make_vehicle(self) -> VehicleParameters:
         """Return the case's vehicle with its changes."""
         changes = {
@@ -242,11 +268,12 @@ class Case(BaseCase):
         if bad := sorted(name for name, value in measured.items() if not np.isfinite(value)):
             raise ValueError(f"metrics not finite: {', '.join(bad)}")
         noted = [str(warning.message) for warning in caught if warning.category is UserWarning]
+        noted += map(str, driven.path.metadata.get("warnings", []))
         result |= {
             "end": driven.end,
             "metrics": measured,
             "solver": solver_summary(driven),
-            "warnings": sorted({*noted, *driven.path.metadata.get("warnings", [])}),
+            "warnings": sorted({shortened(text, LONGEST_MESSAGE) for text in noted}),
             **({} if computing is None else {"latency": computing.summary()}),
             "trace": driven.trace.as_dict(),
         }
@@ -264,24 +291,50 @@ def project_digest() -> str:
 
 
 def run_case(spec: Mapping[str, Any], kind: type[BaseCase] = Case) -> dict[str, Any]:
-    """Run one case; an exception in it becomes its result.
+    """Run one case; whatever goes wrong in it becomes its result.
 
     The result has `id`, the spec's fields, `status` ("ok" or "failed" with `error`), `seconds`, and
-    the entries of the case's `drive`.
+    the entries of the case's `drive`. It is as a folder of results gives it back: a case whose
+    result cannot be stored has failed.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        On Ctrl-C.
     """
     case = kind(**spec)
-    result: dict[str, Any] = {"id": case.id, **case.as_dict(), "status": "ok", "end": None}
-    began = time.perf_counter()
+    first = {
+        "id": case.id, **case.as_dict(), "status": "ok", "end": None, "manifest": manifest_key(),
+    }  # fmt: skip
+    result, began = dict(first), time.perf_counter()
     try:
         case.drive(result)
-    except Exception as error:  # noqa: BLE001  a failed case must not end a sweep
-        result |= case.failure(f"{type(error).__name__}: {error}")
-    return {**result, "seconds": time.perf_counter() - began}
+        return as_stored({**result, "seconds": time.perf_counter() - began})
+    except BaseException as error:
+        # A worker ignores Ctrl-C: there, the agent itself raised it.
+        ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        if isinstance(error, KeyboardInterrupt) and not ignored:
+            raise
+        failure = {**case.failure(in_words(error)), "id": first["id"]}
+    failure["seconds"] = time.perf_counter() - began
+    try:
+        return as_stored({**result, **failure})
+    except Exception:  # noqa: BLE001  an entry of the drive is what cannot be stored
+        return as_stored({**first, **failure})
 
 
-def worker_death(spec: Mapping[str, Any], kind: type[BaseCase] = Case) -> dict[str, Any]:
-    """Return the result of a case that killed its worker process twice."""
-    return kind(**spec).failure("the worker process died, twice")
+def in_words(error: BaseException) -> str:
+    """Return kind and message of an exception in one line; a message that raises is left out."""
+    kind = type(error).__name__
+    try:
+        return f"{kind}: {shortened(error, LONGEST_MESSAGE)}"
+    except BaseException:  # noqa: BLE001  a user's own __str__
+        return f"{kind}, whose message cannot be read"
+
+
+def failed_case(spec: Mapping[str, Any], error: str, kind: type[BaseCase] = Case) -> dict[str, Any]:
+    """Return the result of a case that could not be run to its end, with the reason."""
+    return as_stored(kind(**spec).failure(error))
 
 
 def solver_summary(driven: Rollout) -> dict[str, Any]:

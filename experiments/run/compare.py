@@ -20,7 +20,7 @@ Result = Mapping[str, Any]
 EXAMPLE = "python -m experiments.run.compare results/before results/after"
 OUTCOMES = (
     "id", "status", "error", "end", "others", "metrics", "solver", "warnings", "seconds",
-    "latency", "training", "trace",
+    "latency", "training", "trace", "manifest",
 )  # fmt: skip
 """Entries of a result that say how its case went; all others say what was driven."""
 COMPARED = ("status", "end", "others", "metrics", "solver", "warnings")

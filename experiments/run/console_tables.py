@@ -155,7 +155,9 @@ def _cell(measured: Sequence[Result], name: str) -> Cell | None:
     if not came:
         return None
     total = sum(case["metrics"]["duration"] for case in measured)
-    stayed = sum(case["metrics"][f"share_{name}"] * case["metrics"]["duration"] for case in came)
+    stayed = sum(
+        case["metrics"].get(f"share_{name}", 0.0) * case["metrics"]["duration"] for case in came
+    )
     share = stayed / total if total > 0.0 else 0.0
     return Cell(over_seeds(came, f"ale_{name}"), len(came), share)
 

@@ -1,17 +1,21 @@
 """Engines that run specs: in this process, or over a pool of local worker processes.
 
-A worker that dies takes its pool with it. The pool is rebuilt and the specs that were in flight are
-run alone, one by one; one that kills its worker again is marked failed and the sweep goes on.
-Nothing here loads a numerical library, so `one_thread` can be called before they load.
+A spec that takes longer than the limit, or that kills its worker twice, gets the result of a
+failure, and the sweep goes on. Workers talk over pipes: however they and this process end, nothing
+is left of them. Nothing here loads a numerical library, so `one_thread` can be called before they
+load.
 """
 
+import contextlib
+import math
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing.connection import Connection
 from multiprocessing.connection import wait as wait_for
 from types import FrameType
 from typing import Any
@@ -19,8 +23,12 @@ from typing import Any
 Result = dict[str, Any]
 Spec = Mapping[str, Any]
 Run = Callable[[Spec], Result]
+Failed = Callable[[Spec, str], Result]
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+DIED = "the worker process died, twice"
+PATIENCE = 5.0
+"""Time that an idle worker has to end by itself, s."""
 
 
 def one_thread() -> None:
@@ -59,15 +67,70 @@ class Interrupts:
             raise KeyboardInterrupt
 
 
+class OutOfTime(BaseException):
+    """Ends a run past its limit; `except Exception` does not catch it."""
+
+
+class TimeLimit:
+    """Context that raises OutOfTime in its own code after some seconds, then again every second.
+
+    It ends Python code. A call of native code, such as a solver or a compiled loop, is left to
+    return first; code that never does can only be ended from another process. The limit needs the
+    main thread and a system with SIGALRM, and is ignored elsewhere.
+
+    Parameters
+    ----------
+    seconds
+        Time limit, s; `math.inf` sets none.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self.over = False
+        """True once the time has passed."""
+        self._before: Any = None
+
+    def __enter__(self) -> "TimeLimit":
+        possible = hasattr(signal, "setitimer") and math.isfinite(self.seconds)
+        if possible and threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGALRM, self._end)
+            signal.setitimer(signal.ITIMER_REAL, self.seconds, 1.0)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
+        if self._before is not None:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, self._before)
+        return kind is not None and issubclass(kind, OutOfTime)
+
+    def _end(self, _number: int, _frame: FrameType | None) -> None:
+        self.over = True
+        raise OutOfTime
+
+
+def late(limit: float) -> str:
+    """Return the error of a run that took longer than the limit, s."""
+    return f"took longer than {limit:g} s"
+
+
 def in_process(
-    specs: Sequence[Spec], run: Run | None = None, started: Callable[[Spec], None] | None = None
+    specs: Sequence[Spec],
+    run: Run | None = None,
+    started: Callable[[Spec], None] | None = None,
+    failed: Failed | None = None,
+    limit: float = math.inf,
 ) -> Iterator[Result]:
-    """Run specs one after another in this process; `run` is by default that of `Case`."""
-    run = run or _run_case()
+    """Run specs one after another in this process.
+
+    The arguments are those of `local_pool`; the limit holds as far as `TimeLimit` can.
+    """
+    run, failed = run or _run_case(), failed or _failed_case()
     for spec in specs:
         if started is not None:
             started(spec)
-        yield run(spec)
+        with TimeLimit(limit) as clock:
+            result = run(spec)
+        yield failed(spec, late(limit)) if clock.over else result
 
 
 def local_pool(
@@ -75,13 +138,29 @@ def local_pool(
     workers: int,
     run: Run | None = None,
     started: Callable[[Spec], None] | None = None,
-    died: Run | None = None,
+    failed: Failed | None = None,
+    limit: float = math.inf,
 ) -> Iterator[Result]:
     """Run specs over `workers` processes and yield results as they end.
 
-    `run` makes the result of a spec and must be picklable; `died` makes that of a spec that killed
-    its worker twice; both are those of `Case` by default. `started` is called with each spec as it
-    starts.
+    A worker that dies, for example for want of memory, is replaced; its spec is run again at the
+    end, alone. A worker that exceeds the limit is killed.
+
+    Parameters
+    ----------
+    specs
+        What to run.
+    workers
+        Number of processes.
+    run
+        Makes the result of a spec; must be picklable. By default that of `Case`.
+    started
+        Called with each spec as it starts.
+    failed
+        Makes the result of a spec and an error, for one that killed its worker twice or took too
+        long. By default that of `Case`.
+    limit
+        Time limit of a spec, s; the start of a worker does not count.
 
     Raises
     ------
@@ -91,21 +170,17 @@ def local_pool(
     if workers < 1:
         raise ValueError(f"workers must be at least 1, not {workers}")
     one_thread()
-    run, died = run or _run_case(), died or _worker_death()
-    waiting = list(specs)
-    suspects: list[Spec] = []
-    while waiting or suspects:
-        alone = not waiting
-        batch, waiting = (suspects[:1], []) if alone else (waiting, [])
-        suspects = suspects[1:] if alone else suspects
-        unfinished = yield from _pool(batch, 1 if alone else workers, run, started)
-        if unfinished is None:
-            continue
-        running, waiting = unfinished
-        if alone and running:
-            yield died(running[0])
-        else:
-            suspects += running
+    pool = _Pool(specs, workers, run or _run_case(), failed or _failed_case(), limit)
+    try:
+        while pool.unfinished:
+            for spec in pool.assign():
+                if started is not None:
+                    started(spec)
+            yield from pool.collect()
+        pool.dismiss()
+    finally:
+        # Interrupted, or the consumer stopped: do not wait for results that nobody reads.
+        pool.kill()
 
 
 def _run_case() -> Run:
@@ -115,10 +190,177 @@ def _run_case() -> Run:
     return run_case
 
 
-def _worker_death() -> Run:
-    from experiments.run.case import worker_death
+def _failed_case() -> Failed:
+    from experiments.run.case import failed_case
 
-    return worker_death
+    return failed_case
+
+
+class _Pool:
+    """Workers, and the specs that wait for one."""
+
+    def __init__(
+        self, specs: Sequence[Spec], workers: int, run: Run, failed: Failed, limit: float
+    ) -> None:
+        self._most, self._run, self._failed, self._limit = workers, run, failed, limit
+        self._fresh = list(reversed(specs))
+        self._suspects: list[Spec] = []
+        self._workers: list[_Worker] = []
+
+    @property
+    def _busy(self) -> list["_Worker"]:
+        return [worker for worker in self._workers if worker.spec is not None]
+
+    @property
+    def unfinished(self) -> bool:
+        """True while a spec waits or runs."""
+        return bool(self._fresh or self._suspects or self._busy)
+
+    def assign(self) -> list[Spec]:
+        """Give specs to idle workers; return those that start for the first time."""
+        begun = []
+        while self._fresh and len(self._busy) < self._most:
+            begun.append(self._fresh.pop())
+            self._idle_worker().give(begun[-1], again=False)
+        if self._suspects and not self._busy:
+            self._idle_worker().give(self._suspects.pop(), again=True)
+        return begun
+
+    def _idle_worker(self) -> "_Worker":
+        for worker in self._workers:
+            if worker.spec is None:
+                return worker
+        self._workers.append(_Worker(self._run))
+        return self._workers[-1]
+
+    def collect(self) -> list[Result]:
+        """Wait for messages, deaths and ends of time; return the results that there are."""
+        results = []
+        for worker in self._ready():
+            message = worker.message()
+            if message is None:
+                results += self._replace(worker)
+            else:
+                results += message
+        return results
+
+    def _ready(self) -> list["_Worker"]:
+        busy, limit = self._busy, self._limit
+        while True:
+            left = min(limit - worker.lasted for worker in busy)
+            # A dead worker's pipe stays open while its own children hold it: look every second.
+            ready = wait_for([worker.pipe for worker in busy], min(max(left, 0.0), 1.0))
+            found = [
+                worker
+                for worker in busy
+                if worker.pipe in ready or worker.lasted > limit or not worker.process.is_alive()
+            ]
+            if found:
+                return found
+
+    def _replace(self, worker: "_Worker") -> list[Result]:
+        """End a worker that has died or exceeded its time; return what became of its spec."""
+        worker.kill()
+        self._workers.remove(worker)
+        assert worker.spec is not None
+        if worker.lasted > self._limit:
+            return [self._failed(worker.spec, late(self._limit))]
+        if worker.again:
+            return [self._failed(worker.spec, DIED)]
+        self._suspects.append(worker.spec)
+        return []
+
+    def dismiss(self) -> None:
+        """Let all workers end by themselves."""
+        for worker in self._workers:
+            worker.pipe.close()
+        for worker in self._workers:
+            worker.process.join(PATIENCE)
+
+    def kill(self) -> None:
+        """End all workers at once."""
+        for worker in self._workers:
+            worker.kill()
+
+
+class _Worker:
+    """A process that runs one spec after another."""
+
+    def __init__(self, run: Run) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs, run))
+        self.process.start()
+        theirs.close()
+        self.spec: Spec | None = None
+        self.again = False
+        self._began = math.inf
+
+    @property
+    def lasted(self) -> float:
+        """Time since it began its spec, s; negative before."""
+        return time.monotonic() - self._began
+
+    def give(self, spec: Spec, *, again: bool) -> None:
+        """Give it a spec to run, for the second time if `again`."""
+        self.spec, self.again, self._began = spec, again, math.inf
+        # A worker that has died is noticed when its message is read.
+        with contextlib.suppress(OSError):
+            self.pipe.send(spec)
+
+    def message(self) -> list[Result] | None:
+        """Read what it sent: a result, or none yet; None if it has died or exceeded its time.
+
+        Raises
+        ------
+        BaseException
+            What the run raised.
+        """
+        try:
+            if not self.pipe.poll():
+                return None
+            kind, content = self.pipe.recv()
+        except Exception:  # noqa: BLE001  a torn message is anything
+            return None
+        if kind == "raised":
+            raise content
+        if kind == "begun":
+            self._began = time.monotonic()
+            return []
+        self.spec = None
+        return [content]
+
+    def kill(self) -> None:
+        """End it at once."""
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+def _serve(pipe: Connection, run: Run) -> None:
+    """Run the specs that come through a pipe, until it is closed."""
+    _begin_worker()
+    while True:
+        try:
+            spec = pipe.recv()
+        except EOFError:
+            return
+        pipe.send(("begun", None))
+        try:
+            answer = pickle.dumps(("done", run(spec)))
+        except BaseException as error:  # noqa: BLE001  raised again in the parent
+            answer = _exception(error)
+        pipe.send_bytes(answer)
+
+
+def _exception(error: BaseException) -> bytes:
+    """Pickle an exception, or where that cannot be done its text."""
+    try:
+        answer = pickle.dumps(("raised", error))
+        pickle.loads(answer)  # noqa: S301  of our own making
+    except Exception:  # noqa: BLE001  anything can happen in an exception's own methods
+        return pickle.dumps(("raised", RuntimeError(f"a run raised {type(error).__name__}")))
+    return answer
 
 
 def _begin_worker() -> None:
@@ -132,45 +374,12 @@ def _begin_worker() -> None:
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
+    with contextlib.suppress(ImportError, AttributeError, OSError):
+        # The thread cannot run while native code holds the interpreter: there, the system ends the
+        # process, when the sentinel's other end is closed.
+        import fcntl
 
-
-def _pool(
-    specs: Sequence[Spec], workers: int, run: Run, started: Callable[[Spec], None] | None
-) -> Generator[Result, None, tuple[list[Spec], list[Spec]] | None]:
-    """Run specs in one pool; if it breaks, return those in flight and those not started."""
-    context = multiprocessing.get_context("spawn")
-    queue = list(specs)
-    running: dict[Future[Result], Spec] = {}
-    unfinished = None
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker)
-    try:
-        while queue or running:
-            while queue and len(running) < workers:
-                try:
-                    future = pool.submit(run, queue[0])
-                except BrokenProcessPool:
-                    break
-                running[future] = spec = queue.pop(0)
-                if started is not None:
-                    started(spec)
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            # Results from before the pool broke are still valid.
-            ended = [future for future in done if not _broken(future)]
-            for future in ended:
-                running.pop(future)
-                yield future.result()
-            if not ended:
-                unfinished = list(running.values()), queue
-                break
-    except BaseException:
-        # Interrupted, or the consumer stopped: do not wait for results that nobody reads.
-        for process in list((getattr(pool, "_processes", None) or {}).values()):
-            process.terminate()
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-    return unfinished
-
-
-def _broken(future: Future[Result]) -> bool:
-    return isinstance(future.exception(), BrokenProcessPool)
+        sentinel = int(parent.sentinel)
+        fcntl.fcntl(sentinel, fcntl.F_SETOWN, os.getpid())
+        flags = fcntl.fcntl(sentinel, fcntl.F_GETFL)
+        fcntl.fcntl(sentinel, fcntl.F_SETFL, flags | os.O_ASYNC)

@@ -2,18 +2,25 @@
 
 import hashlib
 import importlib.metadata
+import json
 import os
 import platform
 import subprocess
 import sys
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 PACKAGES = (
-    "lpv-track-env", "numpy", "scipy", "numba", "casadi", "gymnasium", "torch",
+    "lpv-track-env", "numpy", "scipy", "numba", "llvmlite", "casadi", "gymnasium", "torch",
     "stable-baselines3", "highway-env", "cma", "piqp", "rosbags", "commonroad-vehicle-models",
 )  # fmt: skip
 """Packages that results depend on; the optional ones are listed where they are installed."""
+COMPUTING = ("numpy", "scipy", "numba", "llvmlite", "casadi", "gymnasium")
+"""Packages that compute every result: their versions are part of a case's id."""
+OPTIONAL = ("torch", "stable-baselines3", "piqp", "highway-env", "commonroad-vehicle-models")
+"""Packages that a user's own agent may compute with, where they are installed."""
 
 
 def provenance() -> dict[str, Any]:
@@ -69,8 +76,42 @@ def revision() -> dict[str, Any]:
 
 def versions(*further: str) -> dict[str, str]:
     """Return the versions of Python, of `PACKAGES` and of `further` packages, if installed."""
-    found = {"python": platform.python_version()}
-    for package in (*PACKAGES, *further):
+    return {"python": platform.python_version(), **_installed(*PACKAGES, *further)}
+
+
+@cache
+def computing_versions(*packages: str) -> dict[str, str]:
+    """Return what may change the last digits of a result: versions of packages that compute.
+
+    Python counts by its minor version, the machine by its architecture.
+    """
+    python = ".".join(platform.python_version_tuple()[:2])
+    return {"python": python, "machine": platform.machine(), **_installed(*packages)}
+
+
+@cache
+def manifest_key() -> str:
+    """Return the key of the present versions of all packages that results depend on."""
+    present = [versions(), platform.machine()]
+    return hashlib.sha256(json.dumps(present, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def version_changes(before: Mapping[str, Any]) -> list[str]:
+    """Return where versions differ from a manifest's, as "numpy 2.1.0 instead of 2.2.0"."""
+    then, now = before.get("versions"), versions()
+    if not isinstance(then, Mapping):
+        return []
+    names = [name for name in now if name in ("python", *COMPUTING, *OPTIONAL)]
+    return [
+        f"{name} {then[name]} instead of {now[name]}"
+        for name in names
+        if name in then and then[name] != now[name]
+    ]
+
+
+def _installed(*packages: str) -> dict[str, str]:
+    found = {}
+    for package in packages:
         try:
             found[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:

@@ -1,8 +1,9 @@
 """Folder of results: a JSON line per case, traces beside it, a manifest.
 
-Layout: `manifest.json` (revision, versions, settings, hardware), `cases.jsonl`, `traces/ID.npz`.
-A run that was killed can be resumed: a torn last line is dropped, the last of several lines with
-one id counts, and files are replaced atomically.
+Layout: `manifest.json` (revision, versions, settings, hardware), `cases.jsonl`, `traces/ID.npz`,
+and `manifest-KEY.json` of earlier runs with other versions. A run that was killed can be resumed: a
+torn last line is dropped, the last of several lines with one id counts, and files are replaced
+atomically. Who writes holds the folder's lock (`experiments.run.folder_lock`).
 """
 
 import io
@@ -10,7 +11,7 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.run.provenance import command_line, provenance
-from trajectories.fileio import write_atomically
+from experiments.run.provenance import command_line, manifest_key, provenance
+from experiments.run.result_schema import Case, read_case
+from trajectories.fileio import checked, read_bytes, read_json, write_atomically
 
 Array = NDArray[np.float64]
+
+MOST_BYTES = 2**30
+"""Largest `cases.jsonl` that is read."""
+LARGEST_TRACE = 2**28
+"""Largest trace that is read, bytes on disk and in memory."""
+LARGEST_NUMBER = 1e12
+"""Bound on the numbers of a trace that is read."""
 
 
 def write_arrays(file: Path, arrays: Mapping[str, Any]) -> None:
@@ -70,58 +79,100 @@ class ResultStore:
             handle.seek(0)
             handle.truncate(handle.read().rfind(b"\n") + 1)
 
-    def cases(self) -> list[dict[str, Any]]:
+    def cases(
+        self, skipped: list[str] | None = None, read: Callable[[bytes, str], Case] = read_case
+    ) -> list[Case]:
         """Return the results in the order of their first lines, without traces.
 
         The last line of an id counts.
 
+        Parameters
+        ----------
+        skipped
+            Receives a message for each line that cannot be read; without it they are refused.
+        read
+            Reads a line, such as `experiments.run.result_schema.read_driven`.
+
         Raises
         ------
         ValueError
-            For a line other than the last that is not JSON.
+            In one line, for a line other than the last that cannot be read, or a file that is too
+            large.
         """
         if not self.cases_file.exists():
             return []
-        found: dict[str, dict[str, Any]] = {}
-        content = self.cases_file.read_bytes()
+        found: dict[str, Case] = {}
+        content = read_bytes(self.cases_file, MOST_BYTES)
         complete, _, _ = content.rpartition(b"\n")
         for number, line in enumerate(complete.split(b"\n"), start=1):
             if not line.strip():
                 continue
             try:
-                result = json.loads(line)
+                result = read(line, f"{self.cases_file}, line {number}")
+            except ValueError as error:
+                if skipped is None:
+                    raise
+                skipped.append(str(error))
+            else:
                 found[result["id"]] = result
-            except (ValueError, KeyError, TypeError) as error:
-                message = f"{self.cases_file}, line {number}: not a case ({error})"
-                raise ValueError(message) from error
         return list(found.values())
 
     def trace(self, case_id: str) -> dict[str, Array] | None:
-        """Return the arrays of a case's trace by name, or None if it is missing or damaged."""
+        """Return the arrays of a case's trace by name, or None if it is missing or damaged.
+
+        Arrays hold finite numbers.
+        """
         file = self.folder / "traces" / f"{case_id}.npz"
         try:
-            with np.load(file, allow_pickle=False) as arrays:
-                return {name: arrays[name] for name in arrays.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
+            content = io.BytesIO(read_bytes(file, LARGEST_TRACE))
+            with zipfile.ZipFile(content) as packed:
+                if sum(entry.file_size for entry in packed.infolist()) > LARGEST_TRACE:
+                    return None
+            with np.load(content, allow_pickle=False) as arrays:
+                trace = {name: arrays[name] for name in arrays.files}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError):
             return None
+        if not all(array.dtype.kind in "fiu" and _finite(array) for array in trace.values()):
+            return None
+        return {name: array.astype(float, copy=False) for name, array in trace.items()}
 
     def write_manifest(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Write and return the manifest, which holds what is needed to reproduce the results."""
+        """Write and return the manifest, which holds what is needed to reproduce the results.
+
+        That of an earlier run with other versions is kept as `manifest-KEY.json`.
+        """
         manifest = {
             "format": "lpv-track-results/1",
+            "key": manifest_key(),
             "written": datetime.now(UTC).isoformat(timespec="seconds"),
             "command": command_line(),
             "settings": dict(settings),
             **provenance(),
         }
-        content = json.dumps(manifest, indent=2, sort_keys=True).encode()
-        write_atomically(self.folder / "manifest.json", content)
+        before = self.manifest()
+        if before and (key := str(before.get("key", "before"))) != manifest["key"] and is_key(key):
+            write_json(self.folder / f"manifest-{key}.json", before)
+        write_json(self.folder / "manifest.json", manifest)
         return manifest
 
     def manifest(self) -> dict[str, Any]:
-        """Return the manifest, or {} without one."""
+        """Return the manifest of the last run, or {} without a readable one."""
+        file = self.folder / "manifest.json"
         try:
-            content: dict[str, Any] = json.loads((self.folder / "manifest.json").read_text())
-        except (OSError, ValueError):
+            return checked(read_json(file), dict[str, Any], file)
+        except ValueError:
             return {}
-        return content
+
+
+def write_json(file: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON for readers, atomically."""
+    write_atomically(file, json.dumps(content, indent=2, sort_keys=True).encode())
+
+
+def is_key(text: str) -> bool:
+    """Return whether a text can be the key in a manifest's name."""
+    return text == "before" or (len(text) == 8 and set(text) <= set("0123456789abcdef"))
+
+
+def _finite(array: Array) -> bool:
+    return bool((np.abs(array) < LARGEST_NUMBER).all())

@@ -91,7 +91,8 @@ class Setting(NamedTuple):
         if self.conditions != DEFAULT.conditions:
             parts.append(f"conditions {conditions_words(json.loads(self.conditions))}")
         if computing := json.loads(self.computing):
-            parts.append(f"computing {computing['arrangement']} x {computing.get('load', 1):g}")
+            arrangement = computing.get("arrangement", "?")
+            parts.append(f"computing {arrangement} x {computing.get('load', 1):g}")
         if self.control_period != DEFAULT.control_period:
             parts.append(f"control period {self.control_period} s")
         if changed := json.loads(self.env_settings):

@@ -52,6 +52,10 @@ class TrafficCase(BaseCase):
         if self.agent not in OWN:
             check_settings(self.agent, self.agent_settings)
 
+    def packages(self) -> tuple[str, ...]:
+        """Return the packages that compute a result."""
+        return (*super().packages(), "highway-env")
+
     def make_env(self, **settings: Any) -> gymnasium.Env[Any, Any]:
         """Make the case's environment; `settings` are added to the case's own."""
         return gymnasium.make(

@@ -10,7 +10,7 @@ window: it looks a few windows ahead on a copy of the drive, disturbances includ
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ from lpv_track_env import kernels as k
 from lpv_track_env.conditions import layout
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import CurvatureBands
-from trajectories.fileio import write_atomically
+from trajectories.fileio import checked, read_json, write_atomically
 
 Array = NDArray[Any]
 
@@ -55,8 +55,8 @@ def study_oracles(
     """
     file = study.folder / FILE
     if file.exists():
-        kept = json.loads(file.read_text())
-        return [Headroom(**row) for row in kept["headroom"]], kept["greedy"]
+        kept = checked(read_json(file), StoredOracles, file)
+        return kept["headroom"], kept["greedy"]
     given = study.sets[0]
     found = [
         result.weights[0]
@@ -136,6 +136,13 @@ class Headroom:
     def gain(self, fixed: float) -> float:
         """Return the gain in hindsight, as a share of the best fixed set's score."""
         return 1.0 - self.hindsight / fixed
+
+
+class StoredOracles(TypedDict):
+    """Content of `oracle.json`."""
+
+    headroom: list[Headroom]
+    greedy: float | None
 
 
 def headroom(scores: Array, known: Array) -> list[Headroom]:

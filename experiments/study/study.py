@@ -9,9 +9,10 @@ import json
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +20,12 @@ from numpy.typing import NDArray
 from agents.weight_tuning.policy import load
 from experiments.jobs.job import PROGRESS, Line, Listener, read_lines
 from experiments.run.engines import local_pool
+from experiments.run.folder_lock import locked
 from experiments.run.store import write_arrays
 from experiments.study.evaluation import FIGURES, EvaluationSet, Evaluator
 from experiments.tuning.loop import WEIGHTS, tune
 from experiments.tuning.settings import TuningSettings, usual
-from trajectories.fileio import write_atomically
+from trajectories.fileio import checked, read_json, write_atomically
 from trajectories.naming import choose
 
 Array = NDArray[Any]
@@ -121,6 +123,13 @@ def checked_labels(labels: Sequence[str]) -> tuple[str, ...]:
 # The study's folder -------------------------------------------------------------------------------
 
 
+class StoredStudy(TypedDict):
+    """Content of `study.json`."""
+
+    solves: int
+    sets: dict[str, Any]
+
+
 @dataclass(frozen=True)
 class Study:
     """A study: trainings of `labels` for `seeds`, each of `solves` times the rung's factor."""
@@ -141,18 +150,23 @@ class Study:
             },
         }  # fmt: skip
 
-    def claim(self) -> None:
-        """Make the folder this study's.
+    @contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Make the folder this study's, and lock it meanwhile.
 
         Raises
         ------
         ValueError
-            If it holds a study with another budget or other drives.
+            If it holds a study with another budget or other drives, or another process uses it.
         """
-        self.folder.mkdir(parents=True, exist_ok=True)
+        with locked(self.folder):
+            self._claim()
+            yield
+
+    def _claim(self) -> None:
         file, own = self.folder / SETTINGS, self.as_dict()
         if file.exists():
-            kept = json.loads(file.read_text())
+            kept = checked(read_json(file), StoredStudy, file)
             same = kept["solves"] == own["solves"] and all(
                 kept["sets"].get(name, given) == given for name, given in own["sets"].items()
             )
@@ -249,7 +263,7 @@ def run_trainings(study: Study, workers: int) -> Iterator[tuple[int, int]]:
         if not ((folder := study.training(rung.label, seed)) / WEIGHTS).exists()
     ]  # fmt: skip
     yield 0, len(specs)
-    for k, _ in enumerate(local_pool(specs, workers, run=train_one, died=_died)):
+    for k, _ in enumerate(local_pool(specs, workers, run=train_one, failed=_died)):
         yield k + 1, len(specs)
 
 
@@ -264,9 +278,9 @@ def run_evaluations(study: Study, workers: int) -> Iterator[tuple[int, int]]:
         ]
         specs += [{"set": given, "todo": todo[k : k + BLOCK]} for k in range(0, len(todo), BLOCK)]
     yield 0, len(specs)
-    for k, _ in enumerate(local_pool(specs, workers, run=evaluate_one, died=_died)):
+    for k, _ in enumerate(local_pool(specs, workers, run=evaluate_one, failed=_died)):
         yield k + 1, len(specs)
 
 
-def _died(spec: Mapping[str, Any]) -> dict[str, Any]:
-    raise RuntimeError(f"a worker died, twice, over {spec.get('label') or spec['set'].name}")
+def _died(spec: Mapping[str, Any], error: str) -> dict[str, Any]:
+    raise RuntimeError(f"{spec.get('label') or spec['set'].name}: {error}")

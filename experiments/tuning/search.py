@@ -34,7 +34,7 @@ from agents.weights import WeightSchedule
 from experiments.tuning.settings import TuningSettings
 from experiments.tuning.tuner import Tuner, TuningDrives, schedule_of, unusable, weights_at
 from trajectories import CurvatureBands, ReferencePath
-from trajectories.fileio import write_atomically
+from trajectories.fileio import read_json, write_atomically
 
 Array = NDArray[Any]
 
@@ -70,13 +70,13 @@ class ReplayedTuner(Tuner):
         if not file.exists():
             return False
         try:
-            content = json.loads(file.read_text())
+            content = read_json(file)
             if content["format"] != FORMAT:
                 raise ValueError(f"its format is {content['format']!r}, not {FORMAT!r}")
             self.replay(content)
         except KeyError as error:
             raise ValueError(unusable(file, f"no {error} in it")) from None
-        except (OSError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        except (TypeError, AttributeError, ValueError) as error:
             raise ValueError(unusable(file, str(error))) from None
         return True
 

@@ -291,6 +291,6 @@ def run_situation(spec: Mapping[str, Any]) -> dict[str, Any]:
     return {**spec, "error": "", "measures": on.measure(situation, fatrop=spec["fatrop"])}
 
 
-def situation_death(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the result of a situation whose worker process died twice."""
-    return {**spec, "error": "the worker process died, twice", "measures": {}}
+def situation_death(spec: Mapping[str, Any], error: str) -> dict[str, Any]:
+    """Return the result of a situation that could not be measured, such as by a worker's death."""
+    return {**spec, "error": error, "measures": {}}

@@ -1,5 +1,8 @@
 """Faulty agents for tests, named faulty_agents.py:Class."""
 
+import contextlib
+import ctypes
+import sys
 import time
 
 import numpy as np
@@ -19,3 +22,83 @@ class Hangs:
         if self.calls > WARM_UP + 8:
             time.sleep(3600.0)
         return np.array([self.rolling, 0.0]), state
+
+
+class Rolls:
+    """Drives straight on until it leaves the road; the base of those that do worse."""
+
+    def __init__(self, task) -> None:
+        self.rolling = task.vehicle.rolling_deceleration
+
+    def predict(self, _observation, state=None, *_, **__):
+        return np.array([self.rolling, 0.0]), (state,)
+
+
+class Explains(Rolls):
+    """Reports values of NumPy's types, which JSON does not know."""
+
+    numbers = np.float32(0.25), np.int64(3)
+
+    def diagnostics(self, _memory):
+        seconds, iterations = self.numbers
+        return {
+            "status": np.int64(7), "fallback": None, "seconds": seconds, "iterations": iterations,
+            "slack": np.zeros(3),
+        }  # fmt: skip
+
+
+class ExplainsNothing(Explains):
+    """Reports iterations that are no number."""
+
+    numbers = 0.1, float("nan")
+
+
+class Exits(Rolls):
+    """Ends the program."""
+
+    def predict(self, *_, **__):
+        sys.exit("enough")
+
+
+class UnreadableError(Exception):
+    """Has no message that can be read."""
+
+    def __str__(self) -> str:
+        raise RuntimeError("no message")
+
+
+class RaisesUnreadably(Rolls):
+    """Raises an exception whose message raises."""
+
+    def predict(self, *_, **__):
+        raise UnreadableError
+
+
+class Shouts(Rolls):
+    """Raises a message that is long, that no terminal should see, and that is no text."""
+
+    def predict(self, *_, **__):
+        raise ValueError("\x1b[31m" + "loud " * 100_000 + "\ud800")
+
+
+class Interrupts(Rolls):
+    """Raises what Ctrl-C raises."""
+
+    def predict(self, *_, **__):
+        raise KeyboardInterrupt
+
+
+class Loops(Rolls):
+    """Never ends, and refuses to be stopped by exceptions."""
+
+    def predict(self, *_, **__):
+        while True:
+            with contextlib.suppress(Exception):
+                time.sleep(0.01)
+
+
+class Sticks(Rolls):
+    """Waits for ever in native code, which holds the interpreter."""
+
+    def predict(self, *_, **__):
+        ctypes.PyDLL(None).pause()

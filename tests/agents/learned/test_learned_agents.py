@@ -301,7 +301,7 @@ def test_a_benchmark_with_a_policy_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
-        "experiments.report.build.write_report", lambda folder: folder / "cases.jsonl"
+        "experiments.report.build.write_report", lambda folder, _: folder / "cases.jsonl"
     )
     monkeypatch.chdir(tmp_path)
     write(driving_policy("linear"), tmp_path / "mine.json")

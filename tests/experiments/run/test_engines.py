@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from experiments.run.case import Case, worker_death
+from experiments.run.case import Case, failed_case
 from experiments.run.engines import in_process, local_pool
 
 Spec = Mapping[str, Any]
@@ -81,7 +81,7 @@ def seeds(results: Sequence[Mapping[str, Any]]) -> list[int]:
 def test_both_engines_give_the_same_results() -> None:
     cases, begun = specs(6), []
     here = list(in_process(cases, run=note))
-    pooled = list(local_pool(cases, 2, run=note, died=worker_death, started=begun.append))
+    pooled = list(local_pool(cases, 2, run=note, failed=failed_case, started=begun.append))
     assert [result["seed"] for result in here] == list(range(6))
     assert {result["pid"] for result in here} == {os.getpid()}
     assert os.getpid() not in {result["pid"] for result in pooled}
@@ -110,7 +110,7 @@ def test_a_case_that_kills_its_worker_is_reported_and_no_other_suffers(
 
 def test_a_worker_that_dies_once_costs_nothing(tmp_path: Path) -> None:
     cases = specs(3, mark=str(tmp_path / "died"))
-    results = list(local_pool(cases, 1, run=kill_once, died=worker_death))
+    results = list(local_pool(cases, 1, run=kill_once, failed=failed_case))
     assert seeds(results) == [0, 1, 2]
     assert {result["status"] for result in results} == {"ok"}
     assert (tmp_path / "died").exists()
@@ -119,7 +119,7 @@ def test_a_worker_that_dies_once_costs_nothing(tmp_path: Path) -> None:
 def test_what_a_run_raises_comes_through_and_ends_the_pool() -> None:
     began = time.monotonic()
     with pytest.raises(ArithmeticError, match="no such luck"):
-        list(local_pool(specs(6), 2, run=raise_one, died=worker_death))
+        list(local_pool(specs(6), 2, run=raise_one, failed=failed_case))
     assert workers_left() == []
     assert time.monotonic() - began < 60
 
@@ -138,7 +138,7 @@ def test_in_process_passes_on_what_a_run_raises() -> None:
 
 def test_stopping_early_ends_the_workers() -> None:
     began = time.monotonic()
-    run = local_pool(specs(6), 2, run=linger, died=worker_death)
+    run = local_pool(specs(6), 2, run=linger, failed=failed_case)
     assert next(run)["seed"] == 0
     run.close()  # type: ignore[attr-defined]
     assert workers_left() == []
@@ -146,12 +146,12 @@ def test_stopping_early_ends_the_workers() -> None:
 
 
 def test_more_workers_than_cases() -> None:
-    assert seeds(list(local_pool(specs(2), 5, run=note, died=worker_death))) == [0, 1]
-    assert list(local_pool([], 5, run=note, died=worker_death)) == []
+    assert seeds(list(local_pool(specs(2), 5, run=note, failed=failed_case))) == [0, 1]
+    assert list(local_pool([], 5, run=note, failed=failed_case)) == []
     assert workers_left() == []
 
 
 @pytest.mark.parametrize("workers", [0, -1])
 def test_no_workers_are_refused(workers: int) -> None:
     with pytest.raises(ValueError, match=f"workers must be at least 1, not {workers}"):
-        next(local_pool(specs(1), workers, run=note, died=worker_death))
+        next(local_pool(specs(1), workers, run=note, failed=failed_case))

@@ -69,8 +69,12 @@ def test_a_damaged_line_in_the_middle_is_named(store, line):
     with store.cases_file.open("a") as handle:
         handle.write(f"{line}\n")
     store.append(result("b"))
-    with pytest.raises(ValueError, match=r"cases\.jsonl, line 2: not a case"):
+    with pytest.raises(ValueError, match=r"cases\.jsonl, line 2: "):
         store.cases()
+    skipped: list[str] = []
+    assert store.cases(skipped) == [result("a"), result("b")]
+    assert len(skipped) == 1
+    assert "cases.jsonl, line 2: " in skipped[0]
 
 
 def test_empty_lines_are_no_cases(store):

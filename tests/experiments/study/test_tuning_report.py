@@ -107,15 +107,16 @@ def test_the_page_says_what_was_measured(made: Study, tmp_path: Path) -> None:
 
 def test_a_folder_is_one_studys(tmp_path: Path) -> None:
     first = Study(tmp_path, ("default",), (0,), 1000, SETS[:1])
-    first.claim()
     # More rungs, seeds or sets may be added.
-    replace(first, labels=tuple(SCORES), seeds=(0, 1), sets=SETS).claim()
-    first.claim()
+    for one in (first, replace(first, labels=tuple(SCORES), seeds=(0, 1), sets=SETS), first):
+        with one.claimed():
+            pass
     others = (
         replace(first, solves=2000),
         replace(first, sets=(replace(SETS[0], seeds=3),)),
         replace(first, sets=(*SETS[:1], replace(SETS[1], trajectories=("sine",)))),
     )
     for other in others:
-        with pytest.raises(ValueError, match="holds a study of another budget or other drives"):
-            other.claim()
+        match = "holds a study of another budget or other drives"
+        with pytest.raises(ValueError, match=match), other.claimed():
+            pass

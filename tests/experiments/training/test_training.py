@@ -391,7 +391,7 @@ def test_a_file_that_changed_is_another_training(tmp_path: Path) -> None:
 
 
 def test_one_process_trains_in_a_folder(tmp_path: Path) -> None:
-    with locked(tmp_path), pytest.raises(ValueError, match="another process trains"):
+    with locked(tmp_path), pytest.raises(ValueError, match="another process writes"):
         run(tiny("bc"), tmp_path)
     assert len(run(tiny("bc"), tmp_path)["lines"]) == 3
 

@@ -308,7 +308,7 @@ def test_oracles_without_answers_give_no_verdict_for_free() -> None:
 
 
 def test_a_dead_worker_is_a_shortfall() -> None:
-    dead = situation_death({"index": 7})
+    dead = situation_death({"index": 7}, "the worker process died, twice")
     results = [*(result(k) for k in range(99)), dead]
     (line,) = shortfalls(summarise(results), results)
     assert line == "situation 7: the worker process died, twice"

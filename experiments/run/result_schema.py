@@ -1,0 +1,192 @@
+"""Schema of a stored case, and the way of a result into it and back.
+
+The same check holds for what a case leaves and for what anybody may have written into
+`cases.jsonl`: no result is stored that cannot be read.
+"""
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal, Required, TypedDict
+
+import numpy as np
+from msgspec import Meta
+
+from trajectories.fileio import checked, parse_json
+
+Case = dict[str, Any]
+
+Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Time = Annotated[float, Meta(ge=0.0, le=1e12)]
+Count = Annotated[int, Meta(ge=0)]
+Text = Annotated[str, Meta(max_length=100_000)]
+Name = Annotated[str, Meta(max_length=1000)]
+Id = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9_-]{1,64}\Z")]
+"""An id is part of a file's name."""
+Settings = dict[str, Any] | None
+CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
+"""Characters that a terminal takes for commands, and that HTML forbids."""
+
+
+class Solver(TypedDict, total=False):
+    """Times of `predict` (s) and solves."""
+
+    median: Time
+    p99: Time
+    max: Time
+    failures: Count | None
+    solves: Count | None
+    statuses: dict[str, Count]
+    fallbacks: dict[str, Count]
+    mean_iterations: Number | None
+    slack: Annotated[list[Number], Meta(min_length=3, max_length=3)] | None
+
+
+class Training(TypedDict, total=False):
+    """Cost of making a learned policy."""
+
+    algorithm: Name
+    steps: Count
+    seconds: Time
+    solves: Count
+    command: str
+
+
+class Computing(TypedDict, total=False):
+    """Arguments of `experiments.run.computing.ComputingTimes`."""
+
+    arrangement: Name
+    load: Number
+
+
+class Stored(TypedDict, total=False):
+    """A line of `cases.jsonl`; old results lack some entries, and there may be further ones."""
+
+    id: Required[Id]
+    status: Required[Literal["ok", "failed"]]
+    agent: Required[Name]
+    trajectory: Name
+    scene: Name
+    vehicle: Name
+    conditions: Name | dict[str, Any]
+    seed: int
+    speed_mode: Name
+    fixed_speed: Number | None
+    control_period: Annotated[float, Meta(gt=0.0, le=3600.0)]
+    vehicle_changes: Settings
+    agent_settings: Settings
+    env_settings: Settings
+    computing: Computing | None
+    end: Name | None
+    error: Text | None
+    seconds: Time
+    warnings: list[Text]
+    metrics: dict[str, Number]
+    solver: Solver
+    training: Training
+    others: Count | None
+    manifest: Name
+
+
+class Errors(TypedDict, total=False):
+    """Metrics that the tables cannot do without."""
+
+    mle: Required[Number]
+    ale: Required[Number]
+    aoe: Required[Number]
+    duration: Required[Time]
+
+
+class Times(TypedDict, total=False):
+    """Times that the tables cannot do without."""
+
+    median: Required[Time]
+    p99: Required[Time]
+
+
+class Driven(TypedDict, total=False):
+    """What a case on a path that has not failed holds beside the entries of `Stored`."""
+
+    trajectory: Required[Name]
+    metrics: Required[Errors]
+    solver: Required[Times]
+
+
+def read_case(line: bytes, name: str) -> Case:
+    """Read a line of `cases.jsonl`.
+
+    Raises
+    ------
+    ValueError
+        In one line that begins with `name`, if it is not JSON, does not fit the schema, or holds
+        control characters.
+    """
+    case: Case = parse_json(line, name)
+    checked(case, Stored, name)
+    if any(CONTROL.search(text) for text in _texts(case)):
+        raise ValueError(f"{name}: holds control characters")
+    return case
+
+
+def read_driven(line: bytes, name: str) -> Case:
+    """Read a line of `cases.jsonl` whose case drove a path, with all that tables and reports need.
+
+    Raises
+    ------
+    ValueError
+        As `read_case`, or for a case of another kind.
+    """
+    case = read_case(line, name)
+    if case["status"] == "ok":
+        checked(case, Driven, name)
+    return {"metrics": {}, "solver": {}, "warnings": [], **case}
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Yield every text in plain JSON, keys included."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield key
+            yield from _texts(inner)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from _texts(inner)
+
+
+def as_stored(result: Mapping[str, Any]) -> Case:
+    """Return a result as a folder gives it back: plain JSON, and a trace of numbers.
+
+    Raises
+    ------
+    ValueError, TypeError
+        In one line that names the entry, if it holds anything else.
+    """
+    line = {key: plain(value, key) for key, value in result.items() if key != "trace"}
+    checked(line, Stored, "the result")
+    if "trace" not in result:
+        return line
+    trace = {name: np.asarray(values, float) for name, values in result["trace"].items()}
+    return {**line, "trace": trace}
+
+
+def plain(value: Any, name: str) -> Any:
+    """Convert NumPy's values, tuples and mappings to plain JSON; numbers must be finite.
+
+    Raises
+    ------
+    ValueError, TypeError
+        In one line that names the entry.
+    """
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(inner, f"{name}.{key}") for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(inner, f"{name}[{k}]") for k, inner in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{name} is {value}, not a finite number")
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"{name} is of type {type(value).__name__}, which a result cannot hold")
