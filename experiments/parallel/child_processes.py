@@ -1,8 +1,8 @@
 """Child processes that end with their parent and report why they ended.
 
-Each child has a pipe to the supervisor, its link. Through it the child reports that it has attached
-to its mailboxes, that it is ready, or its failure. The child stops when the supervisor closes the
-link or dies.
+Each child has a pipe to the supervisor, its link. Through it the child reports that it is ready,
+its failure, and code that had to be compiled in its real-time loop. The child stops when the
+supervisor closes the link or dies.
 """
 
 import ctypes
@@ -12,13 +12,18 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
+from itertools import takewhile
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
-ATTACHED, READY, FAILED = "attached", "ready", "failed"
+from numba.core import event
+
+READY, FAILED, COMPILED = "ready", "failed", "compiled"
 DEATH_SIGNAL, TIMER_SLACK = 1, 29
 """prctl's PR_SET_PDEATHSIG and PR_SET_TIMERSLACK."""
 GRACE = 0.5
@@ -35,6 +40,10 @@ class Link:
         """Send a word to the supervisor; no effect if it is gone."""
         with suppress(OSError):
             self._connection.send((word, detail))
+
+    def quiet(self) -> AbstractContextManager[None]:
+        """Run the child's real-time loop, see `quiet`; what is compiled in it is reported."""
+        return quiet(partial(self.report, COMPILED))
 
     def stopped(self) -> bool:
         """Return whether the supervisor has closed the link or is gone."""
@@ -69,21 +78,51 @@ def end_with(parent: int) -> None:
         sys.exit(1)
 
 
-def quiet() -> None:
-    """Prepare a real-time loop: no garbage collection, timers accurate to the microsecond."""
+@contextmanager
+def quiet(tell: Callable[[str], None]) -> Iterator[None]:
+    """Run a real-time loop: no garbage collection, timers accurate to the microsecond.
+
+    Everything that the loop calls should be compiled before. `tell` is called, once, with the place
+    at which machine code has to be compiled or loaded nevertheless, which takes from 1 ms to
+    seconds.
+    """
     gc.collect()
     gc.freeze()
     gc.disable()
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(TIMER_SLACK, 1, 0, 0, 0)
+    _set_timer_slack(1)
+    watch = _Watch(tell)
+    event.register("numba:compiler_lock", watch)  # type: ignore[no-untyped-call]
+    try:
+        yield
+    finally:
+        event.unregister("numba:compiler_lock", watch)  # type: ignore[no-untyped-call]
+        _set_timer_slack(0)  # back to the default
+        gc.enable()
+        gc.unfreeze()
 
 
-def no_longer_quiet() -> None:
-    """Undo `quiet`, after the loop."""
-    gc.enable()
-    gc.unfreeze()
+def _set_timer_slack(nanoseconds: int) -> None:
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(TIMER_SLACK, 0, 0, 0, 0)  # 0: back to the default
+        ctypes.CDLL(None).prctl(TIMER_SLACK, nanoseconds, 0, 0, 0)
+
+
+class _Watch(event.Listener):
+    """Tells the place in our code, or in an agent's, at which numba is first asked to compile."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell: Callable[[str], None] | None = tell
+
+    def on_start(self, event: event.Event) -> None:  # noqa: ARG002  part of the protocol
+        if self._tell is None:
+            return
+        tell, self._tell = self._tell, None
+        *_, place = takewhile(
+            lambda frame: f"{os.sep}numba{os.sep}" not in frame.filename, traceback.extract_stack()
+        )
+        tell(f"{place.name} ({place.filename}:{place.lineno})")
+
+    def on_end(self, event: event.Event) -> None:
+        pass
 
 
 class Child:
@@ -110,6 +149,12 @@ class Child:
         self._reports: dict[str, str] = {}
         self.process.start()
         theirs.close()
+
+    @property
+    def compiled(self) -> str:
+        """Place at which the child had to compile in its loop; "" for none."""
+        self._listen()
+        return self._reports.get(COMPILED, "")
 
     def reported(self, word: str) -> bool:
         """Return whether the child has sent a word."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 import agents
 from agents import Agent
 from agents.base import stopping_acceleration
-from experiments.parallel.child_processes import ATTACHED, READY, Link, quiet
+from experiments.parallel.child_processes import READY, Link
 from experiments.parallel.mailbox import Reader, Writer
 from experiments.parallel.setup import (
     COMMAND,
@@ -43,18 +43,22 @@ def control(link: Link, setup: Setup, estimates: Reader, commands: Writer) -> No
         When the agent has failed ten times in a row; each failure before that brakes.
     """
     with estimates, commands:
-        link.report(ATTACHED)
         controller = prepared(setup)
         link.report(READY)
-        quiet()
-        while not link.stopped():
-            message = estimates.wait(controller.patience(time.monotonic_ns()))
-            if message is not None:
-                controller.answer(message.value, message.stamp)
-                commands.put(controller.command)
-            elif controller.is_stale(time.monotonic_ns()):
-                controller.brake_on_stale()
-                commands.put(controller.command)
+        with link.quiet():
+            serve(link, controller, estimates, commands)
+
+
+def serve(link: Link, controller: "Controller", estimates: Reader, commands: Writer) -> None:
+    """Answer estimates as they arrive, and brake when none does."""
+    while not link.stopped():
+        message = estimates.wait(controller.patience(time.monotonic_ns()))
+        if message is not None:
+            controller.answer(message.value, message.stamp)
+            commands.put(controller.command)
+        elif controller.is_stale(time.monotonic_ns()):
+            controller.brake_on_stale()
+            commands.put(controller.command)
 
 
 def prepared(setup: Setup) -> "Controller":

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from experiments.parallel.child_processes import ATTACHED, READY, Link, quiet
+from experiments.parallel.child_processes import READY, Link
 from experiments.parallel.mailbox import Reader, Writer
 from experiments.parallel.setup import ESTIMATE, MS_PER_SECOND, SAMPLE, Setup
 from lpv_track_env import vehicle
@@ -99,14 +99,13 @@ FILTERS: dict[str, Callable[[Setup], Filter]] = {"ekf": Ekf, "truth": Truth}
 def estimate(link: Link, setup: Setup, samples: Reader, estimates: Writer) -> None:
     """Send an estimate each control period until the supervisor stops the process."""
     with samples, estimates:
-        link.report(ATTACHED)
         make = FILTERS[setup.estimator]
         record = np.zeros((), ESTIMATE)
         warm_up(make(setup), record)
         chosen = make(setup)
         link.report(READY)
-        quiet()
-        serve(link, chosen, samples, estimates, record)
+        with link.quiet():
+            serve(link, chosen, samples, estimates, record)
 
 
 def serve(link: Link, chosen: Filter, samples: Reader, estimates: Writer, record: Any) -> None:

@@ -1,6 +1,6 @@
 """A latest-value mailbox between processes: one writer, and readers that never block it.
 
-The values lie in `multiprocessing.shared_memory`: a sequence number, and a few slots used in turn::
+The values lie in shared memory: a sequence number, and a few slots used in turn::
 
     0    uint64   sequence number of the newest complete value, 0 before the first
     64   slots    each [uint64 sequence, int64 stamp, uint64 checksum, value], in lines of 64 bytes
@@ -15,21 +15,19 @@ not, and Python has no memory fence). A copied slot is valid only if it has the 
 number and the CRC-32 over sequence, stamp and value matches. Otherwise the writer has reused the
 slot, or not all of its bytes are visible yet, and the reader tries again.
 
-The name in /dev/shm is needed only until every process has attached: `Mailbox.unlink` then removes
-it, and the system frees the memory with the last process, however that ends. Until then
-multiprocessing's resource tracker would remove it. Children started by multiprocessing share their
-parent's tracker, where attaching registers the same name again, without effect; a tracker of its
-own would remove the mailbox when such a child ends.
+The memory never has a name: a process gets it as an open descriptor, as it gets the pipe. So the
+system frees it with the last process, however that ends, even if all are killed at once.
 """
 
+import mmap
 import os
-import secrets
 import select
 import struct
+import tempfile
 import time
 import zlib
+from multiprocessing import reduction
 from multiprocessing.connection import Connection, Pipe
-from multiprocessing.shared_memory import SharedMemory
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -63,8 +61,7 @@ class Mailbox:
     """Memory and pipe of a mailbox, in the process that creates them and hands out the ends.
 
     The ends are passed to processes as arguments of `multiprocessing.Process` (spawn). A process
-    opens the end that it uses (`open` or `with`) and closes the other; once all ends are open,
-    `unlink` is called.
+    opens the end that it uses (`open` or `with`) and closes the other.
 
     Parameters
     ----------
@@ -86,58 +83,70 @@ class Mailbox:
         if slots < 2:
             raise ValueError(f"a mailbox needs at least 2 slots, not {slots}")
         self.dtype, self.slots = dtype, slots
-        name = f"lpv-track-{os.getpid()}-{secrets.token_hex(4)}"
-        self._memory = SharedMemory(name, create=True, size=FRONT + slots * _stride(dtype))
-        self._linked = True
+        self._descriptor = nameless(FRONT + slots * _stride(dtype))
         waiting, waking = Pipe(duplex=False)
         for connection in (waiting, waking):
             os.set_blocking(connection.fileno(), False)
-        self.writer = Writer(name, dtype, slots, waking)
-        self.reader = Reader(name, dtype, slots, waiting)
+        self.writer = Writer(self._descriptor, dtype, slots, waking)
+        self.reader = Reader(self._descriptor, dtype, slots, waiting)
         """The only reader that can wait."""
 
     def passive_reader(self) -> "Reader":
         """Return a further reader, which can read but not wait."""
-        return Reader(self._memory.name, self.dtype, self.slots, None)
-
-    def unlink(self) -> None:
-        """Remove the name; no end can be opened after that."""
-        if self._linked:
-            self._linked = False
-            self._memory.unlink()
+        return Reader(self._descriptor, self.dtype, self.slots, None)
 
     def close(self) -> None:
-        """Close both ends in this process, and unlink."""
+        """Close both ends in this process."""
         self.writer.close()
         self.reader.close()
-        self.unlink()
-        self._memory.close()
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+
+def nameless(size: int) -> int:
+    """Return the descriptor of new shared memory, `size` bytes of zeros, that has no name."""
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create("mailbox")
+    else:
+        with tempfile.TemporaryFile() as file:
+            descriptor = os.dup(file.fileno())
+    os.ftruncate(descriptor, size)
+    return descriptor
 
 
 class _End:
     """Common part of writer and reader: the views of the memory that `open` creates."""
 
     def __init__(
-        self, name: str, dtype: np.dtype[Any], slots: int, connection: Connection | None
+        self, descriptor: int, dtype: np.dtype[Any], slots: int, connection: Connection | None
     ) -> None:
-        self._name, self._dtype, self._slots = name, dtype, slots
+        self._dtype, self._slots = dtype, slots
         self._connection = connection
         self._stride = _stride(dtype)
-        self._memory: SharedMemory | None = None
+        self._descriptor = os.dup(descriptor)
+        self._memory: mmap.mmap | None = None
         self._buffer: Any = None
         self._front: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Valid for a process that is being started, as of the connection.
+        return {**self.__dict__, "_descriptor": reduction.DupFd(self._descriptor)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _descriptor=state["_descriptor"].detach())
 
     def open(self) -> Self:
         """Attach to the memory, in the process that uses this end.
 
         Raises
         ------
-        FileNotFoundError
-            If the mailbox has been unlinked.
+        OSError
+            If this end has been closed.
         """
         if self._memory is None:
-            self._memory = SharedMemory(self._name)
-            self._buffer = self._memory.buf
+            self._memory = mmap.mmap(self._descriptor, FRONT + self._slots * self._stride)
+            self._buffer = memoryview(self._memory)
             self._front = self._buffer[:8].cast("Q")
         return self
 
@@ -151,9 +160,12 @@ class _End:
         """Detach, and close this process's end of the pipe."""
         if self._memory is not None:
             self._front.release()
-            self._buffer = self._front = None
+            self._buffer.release()
             self._memory.close()
-            self._memory = None
+            self._memory = self._buffer = self._front = None
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
         if self._connection is not None:
             self._connection.close()
             self._connection = None
@@ -190,9 +202,9 @@ class Reader(_End):
     """An end that reads; values are given out once by `wait` and `wait_all`."""
 
     def __init__(
-        self, name: str, dtype: np.dtype[Any], slots: int, connection: Connection | None
+        self, descriptor: int, dtype: np.dtype[Any], slots: int, connection: Connection | None
     ) -> None:
-        super().__init__(name, dtype, slots, connection)
+        super().__init__(descriptor, dtype, slots, connection)
         self.last_read = 0
         """Sequence number of the newest value that was returned."""
         self.writer_gone = False

@@ -12,7 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from experiments.parallel.child_processes import READY, Child, Link, quiet
+from experiments.parallel.child_processes import READY, Child, Link
 from experiments.parallel.mailbox import Mailbox, Message, Reader
 from experiments.parallel.recording import spread
 from experiments.parallel.setup import ESTIMATE
@@ -26,63 +26,49 @@ NAP = 1e-4
 """Sleep of the polling reader between checks, s."""
 TIMEOUT = 1.0
 
-Wait = Callable[[Reader, Any], Message | None]
+Wait = Callable[[Reader], Message | None]
 
 
-def by_pipe(reader: Reader, condition: Any) -> Message | None:
+def by_pipe(reader: Reader) -> Message | None:
     """Wait for the mailbox's pipe, as the run does."""
-    del condition
     return reader.wait(TIMEOUT)
 
 
-def by_polling(reader: Reader, condition: Any) -> Message | None:
+def by_polling(reader: Reader) -> Message | None:
     """Check, sleep a little, check again."""
-    del condition
     while (message := reader.wait(0.0)) is None:
         time.sleep(NAP)
     return message
 
 
-def by_spinning(reader: Reader, condition: Any) -> Message | None:
+def by_spinning(reader: Reader) -> Message | None:
     """Check all the time: the smallest possible latency, at the price of a core."""
-    del condition
     while (message := reader.wait(0.0)) is None:
         pass
     return message
 
 
-def by_condition(reader: Reader, condition: Any) -> Message | None:
-    """Wait for a `multiprocessing.Condition`, whose lock a killed process may hold forever."""
-    with condition:
-        while (message := reader.wait(0.0)) is None:
-            condition.wait(TIMEOUT)
-    return message
-
-
 WAYS: dict[str, Wait] = {
     "mailbox (pipe)": by_pipe,
-    "multiprocessing.Condition": by_condition,
     f"polling every {1e3 * NAP:g} ms": by_polling,
     "spinning": by_spinning,
 }
 
 
-def read(
-    link: Link, reader: Reader, condition: Any, way: str, values: int, sent: Connection
-) -> None:
+def read(link: Link, reader: Reader, way: str, values: int, sent: Connection) -> None:
     """Take the values and send back their latencies, s."""
     wait = WAYS[way]
     latencies: list[float] = []
     reader.open()
     link.report(READY)
-    quiet()
-    while reader.last_read < values + WARM_UP:  # A value that was overwritten is skipped.
-        message = wait(reader, condition)
-        now = time.monotonic_ns()
-        if message is None:
-            raise TimeoutError(f"no value for {TIMEOUT:g} s")
-        if message.sequence > WARM_UP:
-            latencies.append(1e-9 * (now - message.stamp))
+    with link.quiet():
+        while reader.last_read < values + WARM_UP:  # A value that was overwritten is skipped.
+            message = wait(reader)
+            now = time.monotonic_ns()
+            if message is None:
+                raise TimeoutError(f"no value for {TIMEOUT:g} s")
+            if message.sequence > WARM_UP:
+                latencies.append(1e-9 * (now - message.stamp))
     reader.close()
     sent.send_bytes(np.array(latencies).tobytes())
 
@@ -94,24 +80,19 @@ def measure(way: str, values: int) -> NDArray[np.float64]:
     """
     context = multiprocessing.get_context("spawn")
     mailbox = Mailbox(ESTIMATE)
-    condition = context.Condition()
     received, sent = context.Pipe(duplex=False)
     writer = mailbox.writer.open()
-    child = Child("reader", context, read, (mailbox.reader, condition, way, values, sent))
+    child = Child("reader", context, read, (mailbox.reader, way, values, sent))
     sent.close()
     try:
         while not child.reported(READY):
             if child.dead:
                 raise RuntimeError(f"the reader {child.how_it_ended()}")
             time.sleep(PAUSE)
-        mailbox.unlink()
         record = np.zeros((), ESTIMATE)
         for _ in range(values + WARM_UP):
             time.sleep(PAUSE)
             writer.put(record)
-            if WAYS[way] is by_condition:
-                with condition:
-                    condition.notify_all()
         return np.frombuffer(received.recv_bytes())
     except EOFError:
         child.process.join()

@@ -95,6 +95,8 @@ class Outcome:
     final_speed: float
     """Speed after the stop, m/s."""
     commands_refused: int
+    compiled: dict[str, str] = field(default_factory=dict)
+    """Place, by process, at which code had to be compiled or loaded while driving."""
 
 
 def spread(values: Array) -> Summary | None:
@@ -178,6 +180,7 @@ def faults(setup: Setup, outcome: Outcome) -> Summary:
         },
         "failed_solves": int(applied["failures"].max(initial=0)),
         "commands_refused": outcome.commands_refused,
+        "compiled_while_driving": outcome.compiled,
     }
 
 

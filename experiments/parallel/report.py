@@ -68,6 +68,10 @@ def sentences(summary: Summary) -> list[str]:
     if brakings:
         words = ", ".join(f"{count} for {name}" for name, count in brakings.items())
         lines.append(f"commands to brake: {words}")
+    lines += [
+        f"the {name} had to compile while driving, which stalls it: {place}"
+        for name, place in found["compiled_while_driving"].items()
+    ]
     stop = summary["stop"]
     lines.append(
         f"end: {summary['end']}; then stopped in {stop['distance']:.1f} m and "

@@ -12,6 +12,7 @@ from agents.base import stopping_acceleration
 from experiments.parallel.setup import (
     INERTIAL_MS,
     MS_PER_SECOND,
+    SAMPLE,
     STALE_PERIODS,
     STEP,
     WHEEL_MS,
@@ -29,6 +30,8 @@ STANDSTILL = 0.01
 """Speed that counts as standing, m/s."""
 LONGEST_STOP = 60.0
 """Largest simulated time of a stop, s."""
+REHEARSED_MS = 2000
+"""Length of a rehearsal, ms: several fixes at any rate."""
 FOR_EVER = 1e9
 """Age limit that is never reached, s."""
 
@@ -207,3 +210,13 @@ class Sensors:
         if fix is not None:
             arrives = ms + math.ceil(MS_PER_SECOND * self._latency - 1e-6)
             self._coming.append((arrives, time, *fix))
+
+
+def rehearse(setup: Setup) -> None:
+    """Simulate the first seconds of a drive at once, so that all code that it calls is compiled."""
+    vehicle, record = Vehicle(setup), np.zeros((), SAMPLE)
+    sensors = Sensors(setup.known_conditions, setup.fix_ms, setup.seed)
+    for ms in range(0, REHEARSED_MS, setup.tick_ms):
+        vehicle.advance(ms / MS_PER_SECOND)
+        sensors.read(ms, vehicle.info["state"], record)
+    vehicle.stop()

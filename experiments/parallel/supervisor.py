@@ -9,11 +9,9 @@ from contextlib import ExitStack, closing
 import numpy as np
 
 from experiments.parallel.child_processes import (
-    ATTACHED,
     READY,
     Child,
     Stop,
-    no_longer_quiet,
     quiet,
     wait_until,
 )
@@ -30,7 +28,7 @@ from experiments.parallel.setup import (
     STALE_PERIODS,
     Setup,
 )
-from experiments.parallel.simulated_vehicle import Sensors, Vehicle
+from experiments.parallel.simulated_vehicle import Sensors, Vehicle, rehearse
 
 START_TIMEOUT = 180.0
 """Time for both processes to import, and to compile if numba's cache is empty, s."""
@@ -66,6 +64,7 @@ class Supervisor:
         self._recording = Recording()
         self._children: list[Child] = []
         self._fault = ""
+        self._compiled: list[str] = []
         self._origin = 0
         self._sample = np.zeros((), SAMPLE)
         self._publish_times: list[int] = []
@@ -76,10 +75,10 @@ class Supervisor:
     def start(self, say: Say) -> None:
         """Start both processes and wait until they are ready; keep a failure as the fault."""
         context = multiprocessing.get_context("spawn")
-        mailboxes = samples, estimates, commands = [
+        samples, estimates, commands = (
             self._resources.enter_context(closing(Mailbox(dtype, slots=slots)))
             for dtype, slots in ((SAMPLE, SAMPLE_SLOTS), (ESTIMATE, 4), (COMMAND, 4))
-        ]
+        )
         self._samples = samples.writer.open()
         self._commands = commands.reader.open()
         self._estimates = self._resources.enter_context(estimates.passive_reader())
@@ -93,39 +92,30 @@ class Supervisor:
         # Only the children hold these ends, so that each sees when the other is gone.
         for end in (samples.reader, estimates.writer, estimates.reader, commands.writer):
             end.close()
-        if self._all_report(ATTACHED):
-            for mailbox in mailboxes:
-                mailbox.unlink()
-        if self._all_report(READY):
+        rehearse(self.setup)  # while the children start
+        if self._all_ready():
             names = [f"{child.name} {child.process.pid}" for child in self._children]
             say(f"processes: {', '.join(names)}; the clock runs")
 
-    def _all_report(self, word: str) -> bool:
-        """Wait for a word from both children; return False on a fault or a signal."""
+    def _all_ready(self) -> bool:
+        """Wait until both children are ready; return False on a fault or a signal."""
 
-        def reported_or_dead() -> bool:
-            return all(child.reported(word) for child in self._children) or any(
+        def ready_or_dead() -> bool:
+            return all(child.reported(READY) for child in self._children) or any(
                 child.dead for child in self._children
             )
 
-        if self._fault or self._stop.number:
-            return False
-        if not wait_until(reported_or_dead, START_TIMEOUT, self._stop):
-            if not self._stop.number:
-                self._fault = f"the processes were not {word} after {START_TIMEOUT:g} s"
-            return False
+        if not wait_until(ready_or_dead, START_TIMEOUT, self._stop) and not self._stop.number:
+            self._fault = f"the processes were not ready after {START_TIMEOUT:g} s"
         self._check_for_dead()
-        return not self._fault
+        return not self._fault and not self._stop.number
 
     def drive(self) -> Outcome:
         """Simulate the vehicle until time, path or a fault ends the drive; then stop everything."""
         end = ""
         if not self._fault and not self._stop.number:
-            quiet()
-            try:
+            with quiet(self._compiled.append):
                 end = self._loop()
-            finally:
-                no_longer_quiet()
         for child in self._children:
             child.request_stop()
         stopped = self._vehicle.stop()
@@ -140,6 +130,14 @@ class Supervisor:
             stop=stopped,
             final_speed=self._vehicle.speed,
             commands_refused=self._vehicle.commands_refused,
+            compiled={
+                name: place
+                for name, place in (
+                    ("vehicle", "".join(self._compiled)),
+                    *((child.name, child.compiled) for child in self._children),
+                )
+                if place
+            },
         )
 
     def _loop(self) -> str:

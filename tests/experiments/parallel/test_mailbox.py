@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -207,9 +208,14 @@ def read_on(reader: Reader, said: Connection) -> None:
     reader.close()
 
 
-def test_the_name_is_gone_while_both_sides_go_on() -> None:
+def named(process: int | None) -> list[str]:
+    """Shared memory of a process that has a name, which would outlive the process."""
+    maps = Path(f"/proc/{process}/maps")
+    return [line for line in maps.read_text().splitlines() if "/dev/shm/" in line]  # noqa: S108
+
+
+def test_the_memory_has_no_name_that_could_be_left() -> None:
     mailbox = Mailbox(RECORD)
-    shared = Path("/dev/shm") / mailbox._memory.name  # noqa: S108
     writer = mailbox.writer.open()
     heard, said = SPAWN.Pipe(duplex=False)
     process = SPAWN.Process(target=read_on, args=(mailbox.reader, said), daemon=True)
@@ -217,18 +223,43 @@ def test_the_name_is_gone_while_both_sides_go_on() -> None:
     assert heard.poll(30.0)
     assert heard.recv() == "open"
     if sys.platform == "linux":
-        assert shared.exists()
-    mailbox.unlink()
-    assert not shared.exists()
+        assert named(os.getpid()) == named(process.pid) == []
     writer.put(record(5))
     assert heard.poll(30.0)
     assert heard.recv() == 5
     process.join(30.0)
     assert process.exitcode == 0
-    with pytest.raises(FileNotFoundError):
-        mailbox.passive_reader().open()
     mailbox.close()
     mailbox.close()  # Closing twice has no effect.
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        mailbox.passive_reader()
+
+
+def test_mailboxes_leave_no_descriptor_open() -> None:
+    opened = Path("/proc/self/fd")
+    if not opened.is_dir():
+        pytest.skip("this system does not list open files")
+    before = len(list(opened.iterdir()))
+    for _ in range(3):
+        mailbox = Mailbox(RECORD)
+        mailbox.writer.open()
+        mailbox.passive_reader().close()
+        mailbox.close()
+    assert len(list(opened.iterdir())) == before
+
+
+def test_without_memory_files_it_is_a_file_without_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delattr(os, "memfd_create", raising=False)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    mailbox = Mailbox(RECORD)
+    mailbox.writer.open().put(record(3))
+    message = mailbox.reader.open().latest()
+    assert message is not None
+    assert is_whole(message.value)
+    assert list(tmp_path.iterdir()) == []
+    mailbox.close()
 
 
 def test_the_bench_measures_every_value_that_was_taken() -> None:

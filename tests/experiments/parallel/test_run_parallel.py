@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from experiments.commands.run_parallel import verdict
 from experiments.parallel import control
 from experiments.parallel.child_processes import Child, Link, Stop
 from experiments.parallel.recording import COMPLETE, Outcome, Recording, summarise, timing
+from experiments.parallel.report import sentences
 from experiments.parallel.setup import (
     COMMAND,
     DRIVING,
@@ -40,7 +41,6 @@ from tests.helpers import faulty_agents
 
 ROOT = Path(__file__).parents[3]
 AGENTS = Path(faulty_agents.__file__)
-SHARED = Path("/dev/shm")  # noqa: S108
 SLOW = Setup(trajectory="T2", agent="stanley", rate=20, seconds=1.0, watchdog=200)
 """A run at a rate that a busy machine can hold."""
 BUS = VEHICLES["m2-minibus"]
@@ -48,9 +48,11 @@ BUS = VEHICLES["m2-minibus"]
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals")
 
 
-def left_behind(pid: int) -> list[str]:
-    """Return the names of the shared memory of a supervisor's mailboxes."""
-    return [file.name for file in SHARED.glob(f"lpv-track-{pid}-*")] if SHARED.is_dir() else []
+def named_memory(pids: Iterable[int]) -> list[str]:
+    """Return the shared memory of processes that has a name, which would outlive them."""
+    maps = [Path(f"/proc/{pid}/maps") for pid in pids]
+    lines = [line for file in maps if file.exists() for line in file.read_text().splitlines()]
+    return [line for line in lines if "/dev/shm/" in line]  # noqa: S108
 
 
 def ended(pid: int) -> bool:
@@ -93,7 +95,6 @@ def drive(setup: Setup, saboteur: Saboteur) -> Outcome:
         timer.join()
     assert len(saboteur.pids) == 2, outcome.fault
     assert all(ended(pid) for pid in saboteur.pids.values())
-    assert left_behind(os.getpid()) == []
     return outcome
 
 
@@ -129,6 +130,25 @@ def test_a_run_to_its_end() -> None:
     assert summary["periods"] == 20
     assert summary["complete"]
     assert json.dumps(summary, allow_nan=False)
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "truth"])
+@pytest.mark.parametrize("given", ["realtime", "simulation"])
+def test_nothing_is_compiled_or_loaded_while_driving(estimator: str, given: str) -> None:
+    """Whatever the processes found on disk before."""
+    setup = replace(SLOW, agent="lpv-nmpc", conditions=given, estimator=estimator)
+    outcome = drive(setup, Saboteur())
+    assert outcome.end == "seconds"
+    assert outcome.compiled == {}
+
+
+def test_what_is_compiled_while_driving_is_told() -> None:
+    outcome = drive(replace(SLOW, agent=f"{AGENTS}:Compiles"), Saboteur())
+    assert list(outcome.compiled) == ["controller"]
+    assert re.fullmatch(r"predict \(.*faulty_agents.py:\d+\)", outcome.compiled["controller"])
+    assert any(
+        "the controller had to compile" in line for line in sentences(summarise(SLOW, outcome))
+    )
 
 
 @pytest.mark.parametrize("role", ["estimator", "controller"])
@@ -177,14 +197,13 @@ def wait_for_the_end(pids: Iterator[int]) -> None:
 
 
 def test_sigterm_brakes_first_and_ends_all(tmp_path: Path) -> None:
-    process, pids, own = started("--out", str(tmp_path))
+    process, pids, _ = started("--out", str(tmp_path))
     time.sleep(1.5)
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=30.0)
     assert process.returncode == 128 + signal.SIGTERM
     assert "end: SIGTERM" in out
     wait_for_the_end(iter(pids.values()))
-    assert left_behind(own) == []
     result = json.loads((tmp_path / "run.json").read_text())
     assert result["run"]["end"] == "SIGTERM"
     assert result["run"]["stop"]["final_speed"] < 0.02
@@ -194,14 +213,14 @@ def test_sigterm_brakes_first_and_ends_all(tmp_path: Path) -> None:
 
 def test_children_end_with_a_killed_supervisor(tmp_path: Path) -> None:
     process, pids, own = started("--out", str(tmp_path))
+    assert named_memory([own, *pids.values()]) == []
     process.kill()
     process.communicate(timeout=30.0)
     wait_for_the_end(iter(pids.values()))
-    assert left_behind(own) == []
 
 
 def fails(link: Link) -> None:
-    link.report("attached")
+    link.report("ready")
     raise OSError("no such\nthing")
 
 
@@ -210,7 +229,7 @@ def test_a_child_tells_what_it_failed_of() -> None:
     child = Child("estimator", context, fails, ())
     child.process.join(30.0)
     assert child.dead
-    assert child.reported("attached")
+    assert child.reported("ready")
     assert child.how_it_ended() == "failed: OSError: no such thing"
     child.end()
 
