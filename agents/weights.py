@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trajectories import CurvatureBands, ReferencePath
-from trajectories.fileio import write_atomically
+from trajectories.fileio import read_json, shortened, shown, write_atomically
 from trajectories.naming import choose
 
 Array = NDArray[np.float64]
@@ -139,7 +139,7 @@ class WeightSchedule:
         """
         try:
             if content.get("format") not in (FORMAT, WITHOUT_SLEW):
-                raise ValueError(f"format is {content.get('format')!r}, not {FORMAT!r}")
+                raise ValueError(f"format is {shown(content.get('format'))}, not {FORMAT!r}")
             bands, slew = content["bands"], content.get("slew")
             return cls(
                 CurvatureBands(
@@ -155,7 +155,7 @@ class WeightSchedule:
         except KeyError as error:
             raise ValueError(f"no {error} in it") from error
         except (ValueError, TypeError, AttributeError, OverflowError) as error:
-            raise ValueError(" ".join(str(error).split())) from error
+            raise ValueError(shortened(error)) from error
 
     def write(self, file: Path) -> None:
         """Write the schedule as JSON, atomically."""
@@ -171,10 +171,13 @@ class WeightSchedule:
             In one line that names the file, if it cannot be read or is not a schedule.
         """
         try:
-            return cls.from_dict(json.loads(Path(file).read_text(encoding="utf-8")))
-        except (OSError, ValueError, RecursionError) as error:
-            reason = " ".join(str(error).split())
-            raise ValueError(f"weight schedule {file}: {reason}") from error
+            content = read_json(file, infinite=True)  # a slew limit may be infinite
+        except ValueError as error:
+            raise ValueError(f"weight schedule {error}") from error
+        try:
+            return cls.from_dict(content)
+        except ValueError as error:
+            raise ValueError(f"weight schedule {shortened(file)}: {error}") from error
 
 
 def weights_from(value: object) -> TrackingWeights | WeightSchedule:

@@ -1,18 +1,19 @@
 """Vehicle parameters, limits and presets, each number with its source."""
 
 import dataclasses
-import json
 import math
+import sys
 from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lpv_track_env.plausibility import GRAVITY, check_computable, check_plausible
+from trajectories.fileio import read_json, shortened, shown
 from trajectories.naming import suggestion
-
-GRAVITY = 9.81  # m/s^2
 
 PARAMETER_ORDER = (
     "mass",
@@ -26,8 +27,10 @@ PARAMETER_ORDER = (
 """Order of `VehicleParameters.as_array` and of the last arguments of `bicycle.field`."""
 
 
-def _finite(value: object) -> bool:
-    return isinstance(value, Real) and math.isfinite(value)
+def _finite(value: Any) -> bool:
+    """Return whether a value is a number in double precision."""
+    number = isinstance(value, Real) and not isinstance(value, bool)
+    return number and -sys.float_info.max <= value <= sys.float_info.max
 
 
 @dataclass(frozen=True)
@@ -68,11 +71,14 @@ class VehicleParameters:
         Bound of |vy| / vx. In a steady turn at low speed it limits curvature to about ratio / lr.
     length, width
         Size of the body, m, for drawing, and for gaps and collisions in traffic.
+    implausible
+        Takes values outside of `plausibility.PLAUSIBLE` as they are; they suggest other units.
 
     Raises
     ------
     ValueError
-        If a parameter is not positive although it must be, or a range is empty or not finite.
+        If a parameter is not positive although it must be, a range is empty or not finite, a value
+        is implausible, or the dynamics are too fast to be integrated.
     """
 
     name: str
@@ -93,29 +99,31 @@ class VehicleParameters:
     max_lateral_velocity_ratio: float = 0.17
     length: float = 4.5
     width: float = 1.8
+    implausible: bool = False
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
+            value, wanted = getattr(self, field.name), None
             if field.name in {"name", "source"}:
-                continue
-            if field.name.endswith("_range"):
+                wanted = None if isinstance(value, str) and value.isprintable() else "a text line"
+            elif field.name == "implausible":
+                wanted = None if isinstance(value, bool) else "true or false"
+            elif field.name.endswith("_range"):
                 ends = tuple(value) if isinstance(value, tuple | list) else ()
                 if len(ends) != 2 or not all(map(_finite, ends)) or ends[0] >= ends[1]:
-                    raise ValueError(
-                        f"vehicle {self.name!r}: {field.name} must be two finite numbers, "
-                        f"the lower first, not {value!r}"
-                    )
-                object.__setattr__(self, field.name, (float(ends[0]), float(ends[1])))
+                    wanted = "two finite numbers, the lower first"
+                else:
+                    object.__setattr__(self, field.name, (float(ends[0]), float(ends[1])))
             elif field.name == "rolling_resistance":
-                if not (_finite(value) and value >= 0):
-                    raise ValueError(
-                        f"vehicle {self.name!r}: {field.name} must be >= 0, not {value!r}"
-                    )
-            elif not (_finite(value) and value > 0):
+                wanted = None if _finite(value) and value >= 0 else ">= 0"
+            else:
+                wanted = None if _finite(value) and value > 0 else "positive"
+            if wanted is not None:
                 raise ValueError(
-                    f"vehicle {self.name!r}: {field.name} must be positive, not {value!r}"
+                    f"vehicle {shown(self.name)}: {field.name} must be {wanted}, not {shown(value)}"
                 )
+        check_plausible(vars(self))
+        check_computable(vars(self))
 
     @property
     def wheelbase(self) -> float:
@@ -147,7 +155,10 @@ class VehicleParameters:
 
     def as_dict(self) -> dict[str, object]:
         """Parameters as plain values for JSON."""
-        return dataclasses.asdict(self)
+        values = dataclasses.asdict(self)
+        if not self.implausible:  # as in files of before there was this field
+            del values["implausible"]
+        return values
 
 
 COURSE_CAR = VehicleParameters(
@@ -272,6 +283,10 @@ VEHICLES: dict[str, VehicleParameters] = {
 """Vehicle presets by name."""
 
 
+MOST_BYTES = 2**20
+"""Largest vehicle file that is read, bytes."""
+
+
 def load(vehicle: str | Path | VehicleParameters) -> VehicleParameters:
     """Return the vehicle of a preset's name or of a JSON file; parameters are returned as they are.
 
@@ -288,27 +303,21 @@ def load(vehicle: str | Path | VehicleParameters) -> VehicleParameters:
     if path.suffix == ".json":
         return _read(path)
     raise ValueError(
-        f"unknown vehicle {str(vehicle)!r}; {suggestion(vehicle, VEHICLES)}, "
+        f"unknown vehicle {shown(str(vehicle))}; {suggestion(vehicle, VEHICLES)}, "
         "or give a .json file with the fields of VehicleParameters"
     )
 
 
 def _read(path: Path) -> VehicleParameters:
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"cannot read vehicle file {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise ValueError(f"vehicle file {path} is not JSON: {error}") from error
+    values = read_json(path, MOST_BYTES)
+    name = f"vehicle file {shortened(path)}"
     if not isinstance(values, dict):
-        raise ValueError(f"vehicle file {path} must hold one JSON object")  # noqa: TRY004
+        raise ValueError(f"{name} must hold one JSON object")  # noqa: TRY004
     values = {"name": path.stem, "source": str(path.name), **values}
     known = {field.name for field in dataclasses.fields(VehicleParameters)}
     if unknown := sorted(set(values) - known):
-        raise ValueError(
-            f"vehicle file {path}: unknown field {unknown[0]!r}; known: {sorted(known)}"
-        )
+        raise ValueError(f"{name}: unknown field {shown(unknown[0])}; known: {sorted(known)}")
     try:
         return VehicleParameters(**values)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"vehicle file {path}: {error}") from error
+        raise ValueError(f"{name}: {error}") from error

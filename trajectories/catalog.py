@@ -1,6 +1,7 @@
 """Trajectories by name: the paper's six (drivable and raw), analytic shapes, random paths."""
 
 import math
+import os
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from trajectories import files, shapes
 from trajectories.curvature import PathStatistics, signed_waypoint_curvature
+from trajectories.fileio import shown
 from trajectories.naming import suggestion
 from trajectories.path import SPACING, ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
@@ -18,6 +20,8 @@ Array = NDArray[np.float64]
 
 KMH = 1.0 / 3.6
 GENERATOR = "segments/1"
+SEED_DIGITS = 40
+"""Most digits of the seed of a random path."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +95,16 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
     ------
     ValueError
         For an unknown name (the message lists the known ones and the nearest) or a bad file.
+    TypeError
+        For anything but text, a file or a path, such as an array.
     """
     if isinstance(trajectory, ReferencePath):
         return trajectory
+    if not isinstance(trajectory, str | Path):
+        raise TypeError(
+            f"a trajectory is a name, a file or a ReferencePath, not {type(trajectory).__name__}: "
+            "trajectories.ReferencePath takes arrays"
+        )
     name = str(trajectory)
     if name in PUBLISHED:
         return _drivable(name)
@@ -103,11 +114,13 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
         return _analytic(name)
     kind, _, seed = name.rpartition("-")
     if kind in {"random", "random-fast"} and seed.isdecimal():
+        if len(seed) > SEED_DIGITS:
+            raise ValueError(f"trajectory {shown(name)}: a seed has at most {SEED_DIGITS} digits")
         return _random(int(seed), kind == "random-fast")
-    if name.endswith(".csv") or Path(name).is_file():
+    if name.endswith(".csv") or os.path.isfile(name):  # noqa: PTH113  Path's raises for long names
         return files.read(Path(name))
     known = suggestion(name, names(), " and both with any other seed")
-    raise ValueError(f"unknown trajectory {name!r}; {known}, or give a .csv file")
+    raise ValueError(f"unknown trajectory {shown(name)}; {known}, or give a .csv file")
 
 
 @lru_cache(maxsize=256)
@@ -290,6 +303,11 @@ def random_path(
     The same seed gives the same path. Speed limits are drawn too: 6 to 14 m/s (`fast`: 10 to 18),
     1.0 to 2.0 m/s^2 laterally, 1.3 to 2.0 m/s^2 longitudinally. Straights are 8 to 120 m long
     (`fast`: 40 to 400). Unless given, `length` (m) is drawn from 300 to 600 (`fast`: 600 to 1000).
+
+    Raises
+    ------
+    ValueError
+        If `length` is not a number from 0 to `shapes.LONGEST`.
     """
     alone = isinstance(seed, np.random.Generator)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
@@ -304,7 +322,7 @@ def random_path(
         max_lateral_acceleration=float(rng.uniform(1.0, 2.0)),
         max_acceleration=float(rng.uniform(1.3, 2.0)),
     )
-    wanted = float(rng.uniform(*lengths)) if length is None else length
+    wanted = float(rng.uniform(*lengths)) if length is None else shapes.checked_length(length)
     segments = [shapes.Segment(length=float(rng.uniform(20.0, 50.0)))]
     planned = segments[0].length
     while planned < wanted:

@@ -24,13 +24,24 @@ DEEPEST = 32
 """Largest number of JSON objects and lists inside each other."""
 LARGEST_INTEGER = 2**63 - 1
 """Largest integer in JSON, as in a 64-bit integer of NumPy."""
-SHORT = reprlib.Repr()
+
+
+class _Short(reprlib.Repr):
+    """Reprs that fit on a line; Python refuses to write integers of 4300 digits."""
+
+    def repr_int(self, x: int, level: int) -> str:
+        if x.bit_length() > 512:
+            return f"an integer of {x.bit_length()} bits"
+        return super().repr_int(x, level)
+
+
+SHORT = _Short()
 SHORT.maxstring = SHORT.maxother = 80
 
 
 def shown(value: object) -> str:
-    """Return the repr of a value that anybody may have given, shortened to fit on a line."""
-    return SHORT.repr(value)
+    """Return the repr of a value that anybody may have given, shortened to one line."""
+    return shortened(SHORT.repr(value), 120)
 
 
 def shortened(text: object, most: int = 200) -> str:
@@ -86,13 +97,22 @@ def _decoded(content: bytes, name: object) -> str:
         ) from error
 
 
-def read_json(file: str | Path, limit: int = MOST_BYTES) -> Any:
+def read_json(file: str | Path, limit: int = MOST_BYTES, *, infinite: bool = False) -> Any:
     """Read a JSON file; errors as in `read_bytes` and `parse_json`."""
-    return parse_json(read_bytes(file, limit), file)
+    return parse_json(read_bytes(file, limit), file, infinite=infinite)
 
 
-def parse_json(content: str | bytes, name: object) -> Any:
-    """Parse JSON; `name` says in messages where it is from, such as a file and line.
+def parse_json(content: str | bytes, name: object, *, infinite: bool = False) -> Any:
+    """Parse JSON.
+
+    Parameters
+    ----------
+    content
+        Text, or bytes in UTF-8.
+    name
+        Origin for messages, such as a file and line.
+    infinite
+        Reads the words Infinity and NaN, which Python writes although JSON has none.
 
     Raises
     ------
@@ -104,16 +124,12 @@ def parse_json(content: str | bytes, name: object) -> Any:
     text = _decoded(content, name) if isinstance(content, bytes) else content
     try:
         found = json.loads(
-            text, object_pairs_hook=_unique, parse_constant=_refuse, parse_float=_finite,
-            parse_int=_integer,
+            text, object_pairs_hook=_unique, parse_constant=float if infinite else _refuse,
+            parse_float=_finite, parse_int=_integer,
         )  # fmt: skip
         _check_depth(found)
-        if "\\ud" in text.lower():  # half of a surrogate pair: such a text cannot be printed
-            json.dumps(found, ensure_ascii=False).encode()
-    except UnicodeEncodeError:
-        raise ValueError(f"{shortened(name)}: is not JSON: half of a surrogate pair") from None
     except RecursionError:
-        raise ValueError(f"{shortened(name)}: is not JSON of ours: nested too deeply") from None
+        raise ValueError(f"{shortened(name)}: is not JSON: nested too deeply") from None
     except ValueError as error:
         raise ValueError(f"{shortened(name)}: is not JSON: {shortened(error)}") from error
     return found

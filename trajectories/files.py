@@ -10,17 +10,18 @@ import re
 import warnings
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from trajectories.curvature import circle_curvature, signed_waypoint_curvature, statistics
-from trajectories.fileio import read_text, write_atomically
+from trajectories.fileio import checked, parse_json, shortened, shown, write_atomically
 from trajectories.importers import read_gps, read_racetrack, read_xy
 from trajectories.path import ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
-from trajectories.text_table import COLUMNS, TextTable, read_table
+from trajectories.text_table import COLUMNS, TextTable, read_lines, read_table
 
 __all__ = ["read", "read_gps", "read_native", "read_racetrack", "read_xy", "write"]
 
@@ -31,7 +32,29 @@ HEADER = ("s_m", "x_m", "y_m", "psi_rad", "kappa_1pm", "v_mps", "ax_mps2", "t_s"
 FRAME = "local: x, y in m, heading counter-clockwise from x"
 RESERVED = ("format", "name", "closed", "points")
 """Keys of the header that metadata cannot replace."""
+LONGEST_NAME = 200
+"""Most characters of a path's name in a file."""
 _COMMENT = re.compile(r"#\s*(?P<key>[A-Za-z_][\w-]*)\s*:\s*(?P<value>.*)")
+
+
+class Origin(msgspec.Struct):
+    """Place of x = y = 0 on the Earth."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+
+
+class Header(msgspec.Struct):
+    """Keys of the header that are used; others may hold any JSON."""
+
+    name: str = ""
+    closed: bool = False
+    points: int = -1
+    source: str = ""
+    warnings: list[str] = []
+    limits: SpeedLimits | None = None
+    origin: Origin | None = None
 
 
 def write(path: ReferencePath, file: str | Path) -> None:
@@ -90,8 +113,7 @@ def read(file: str | Path) -> ReferencePath:
     ValueError
         If the file cannot be read; the message names the file and the line or column.
     """
-    lines = [line for line in read_text(file).split("\n", 50)[:50] if line.startswith("#")]
-    for line in lines:
+    for line in read_lines(file)[:50]:
         match = _COMMENT.match(line.strip())
         if match is not None and match["key"] == "format":
             return read_native(file)
@@ -126,8 +148,6 @@ def read_native(
     metadata, table = _split(Path(file))
     columns = dict(zip(HEADER, (table.column(k) for k in range(len(HEADER))), strict=True))
     label, closed = metadata.pop("name", Path(file).stem), metadata.pop("closed", False)
-    if not isinstance(label, str) or not isinstance(closed, bool):
-        table.fail("name must be a JSON string and closed true or false")
     s, x, y, psi, kappa, v = (columns[key] for key in HEADER[:6])
     try:
         path = ReferencePath(s, x, y, psi, kappa, v, label if name is None else name, closed,
@@ -139,7 +159,7 @@ def read_native(
     if limits is not None:
         try:
             speed = plan_speed(path.curvature, path.spacing, limits, closed=closed)
-        except RuntimeError as error:
+        except (RuntimeError, ValueError) as error:
             table.fail(str(error))
         path = path.with_speed(speed, limits=asdict(limits))
     return path
@@ -148,12 +168,15 @@ def read_native(
 def _split(file: Path) -> tuple[dict[str, Any], TextTable]:
     """Split a native file into metadata and table, after a check that it is complete."""
     table = TextTable(file, HEADER, [], [])
-    lines = read_text(file).split("\n")
+    lines = read_lines(file)
     metadata = _metadata(lines, table)
     first = len(metadata)
     version = metadata.pop("format", None)
     if version != FORMAT:
-        table.fail(f"format {version!r} is not known, only {FORMAT!r}")
+        table.fail(f"format {shown(version)} is not known, only {FORMAT!r}")
+    header = checked(metadata, Header, file)
+    if len(header.name) > LONGEST_NAME or not header.name.isprintable():
+        table.fail(f"name {shown(header.name)} is no line of at most {LONGEST_NAME} characters")
     if first >= len(lines) or lines[first].strip() != ",".join(HEADER):
         table.fail(f"line {first + 1} is not the header {','.join(HEADER)}")
     if lines[-1].strip():
@@ -164,9 +187,8 @@ def _split(file: Path) -> tuple[dict[str, Any], TextTable]:
             table.fail(f"line {number} has {len(cells)} columns, not {len(HEADER)}")
         table.rows.append(cells)
         table.lines.append(number)
-    points = metadata.pop("points", len(table.rows))
-    if points != len(table.rows):
-        table.fail(f"torn: {len(table.rows)} of {points} points are there")
+    if metadata.pop("points", len(table.rows)) != len(table.rows):
+        table.fail(f"torn: {len(table.rows)} of {header.points} points are there")
     return metadata, table
 
 
@@ -179,15 +201,9 @@ def _metadata(lines: list[str], table: TextTable) -> dict[str, Any]:
         match = _COMMENT.fullmatch(line.strip())
         if match is None or match["key"] in metadata:
             table.fail(f"line {number} is not '# key: JSON' with a new key")
-        try:
-            metadata[match["key"]] = json.loads(match["value"], parse_constant=_no_constant)
-        except (ValueError, RecursionError):
-            table.fail(f"line {number}: {match['key']} is not JSON")
+        where = f"{table.file}: line {number}: {shortened(match['key'], 40)}"
+        metadata[match["key"]] = parse_json(match["value"], where)
     return metadata
-
-
-def _no_constant(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not JSON")
 
 
 def _check_geometry(path: ReferencePath, table: TextTable) -> None:

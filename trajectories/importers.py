@@ -40,6 +40,8 @@ GAP_FACTOR = 10.0
 """Multiple of the median distance from which a gap is warned of."""
 APPROACH, APPROACH_ALONG = 2.5, 20.0
 """m: a path approaches itself if it comes this close to a place this far away along the path."""
+CHUNK = 4096
+"""Points whose neighbours are looked up at once."""
 MINIMUM_LENGTH, MAXIMUM_LENGTH = 1.0, 30_000.0
 """m: other lengths suggest that the coordinates are not metres."""
 LARGEST_COORDINATE = 1e7
@@ -271,7 +273,7 @@ class _Importer:
         before, lines = len(points), list(self.table.lines)
         points = self.thinned(points, DUPLICATE)
         if len(points) < before:
-            first = next(line for line in lines if line not in set(self.table.lines))
+            first = min(set(lines).difference(self.table.lines))
             self.warn(f"{before - len(points)} duplicates under 1 mm merged (first: line {first})")
         if len(points) < MINIMUM_POINTS:
             self.table.fail(f"{len(points)} distinct points, at least {MINIMUM_POINTS} are needed")
@@ -353,13 +355,22 @@ def self_approach(geometry: Geometry, closed: bool) -> tuple[float, float, float
     stride = 2  # 0.5 m: the nearest nodes are at most 0.35 m further apart than the branches
     s = geometry.arc_length[::stride]
     points = np.column_stack([geometry.x[::stride], geometry.y[::stride]])
-    pairs = cKDTree(points).query_pairs(APPROACH, output_type="ndarray")
-    along = np.abs(s[pairs[:, 1]] - s[pairs[:, 0]])
-    if closed:
-        along = np.minimum(along, geometry.arc_length[-1] - along)
-    pairs = pairs[along > APPROACH_ALONG]
-    if not len(pairs):
-        return None
-    distances = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
-    first, second = sorted(pairs[int(np.argmin(distances))])
-    return float(s[first]), float(s[second]), float(distances.min())
+    # A point's nearest neighbours, itself and those on its own branch included: one more than these
+    # must contain the nearest point of another branch. All pairs may be 10^9 where a path lies over
+    # itself many times.
+    count = 2 * math.ceil(APPROACH_ALONG / s[1]) + 2
+    tree = cKDTree(points, balanced_tree=False)
+    best: tuple[float, float, float] | None = None
+    for first in range(0, len(points), CHUNK):
+        rows = slice(first, first + CHUNK)
+        distances, others = tree.query(points[rows], count, distance_upper_bound=APPROACH)
+        along = np.abs(np.append(s, math.inf)[others] - s[rows, None])
+        if closed:
+            along = np.minimum(along, np.abs(geometry.arc_length[-1] - along))
+        distances[along <= APPROACH_ALONG] = math.inf
+        row, column = np.unravel_index(int(np.argmin(distances)), distances.shape)
+        distance = float(distances[row, column])
+        if distance < (APPROACH if best is None else best[2]):
+            ends = sorted((float(s[first + row]), float(s[others[row, column]])))
+            best = ends[0], ends[1], distance
+    return best

@@ -3,6 +3,11 @@
 import difflib
 from collections.abc import Iterable
 
+from trajectories.fileio import shown
+
+LONGEST = 100
+"""Characters of a name that are compared."""
+
 
 def choose(kind: str, value: str, known: tuple[str, ...]) -> str:
     """Return `value` if it is known.
@@ -14,11 +19,11 @@ def choose(kind: str, value: str, known: tuple[str, ...]) -> str:
     """
     if value in known:
         return value
-    raise ValueError(f"unknown {kind} {value!r}; {suggestion(value, known)}")
+    raise ValueError(f"unknown {kind} {shown(value)}; {suggestion(value, known)}")
 
 
 def suggestion(value: object, known: Iterable[str], more: str = "") -> str:
     """Second half of an error message: the known names, `more` after them, and the nearest."""
     names = tuple(known)
-    nearest = difflib.get_close_matches(str(value), names, n=1, cutoff=0.0)[0]
+    nearest = difflib.get_close_matches(str(value)[:LONGEST], names, n=1, cutoff=0.0)[0]
     return f"known: {', '.join(names)}{more} (nearest: {nearest})"

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trajectories import projection, table
+from trajectories.fileio import shown
 
 SPACING = 0.25
 """m between nodes of every path, up to fitting its length exactly."""
@@ -53,7 +54,7 @@ def _finite(what: str, values: ArrayLike) -> Array:
     """Return values of any shape as an array; raise a ValueError unless all are finite."""
     array = np.asarray(values, dtype=np.float64)
     if not np.isfinite(array).all():
-        raise ValueError(f"{what} must be finite, not {values!r}")
+        raise ValueError(f"{what} must be finite, not {shown(values)}")
     return array
 
 
@@ -104,34 +105,36 @@ class ReferencePath:
         n = np.size(self.arc_length)
         if n < MINIMUM_POINTS:
             raise ValueError(
-                f"path {self.name!r}: {n} points, at least {MINIMUM_POINTS} are needed"
+                f"path {shown(self.name)}: {n} points, at least {MINIMUM_POINTS} are needed"
             )
         for column in columns:
             values = np.array(getattr(self, column), dtype=np.float64)
             if values.shape != (n,):
                 raise ValueError(
-                    f"path {self.name!r}: {column} has shape {values.shape}, not ({n},)"
+                    f"path {shown(self.name)}: {column} has shape {values.shape}, not ({n},)"
                 )
             if not np.isfinite(values).all():
                 index = int(np.flatnonzero(~np.isfinite(values))[0])
-                raise ValueError(f"path {self.name!r}: {column}[{index}] is {values[index]}")
+                raise ValueError(f"path {shown(self.name)}: {column}[{index}] is {values[index]}")
             values.flags.writeable = False
             object.__setattr__(self, column, values)
         steps = np.diff(self.arc_length)
         if (steps <= 0).any():
             index = int(np.flatnonzero(steps <= 0)[0]) + 1
-            raise ValueError(f"path {self.name!r}: arc_length does not increase at index {index}")
+            raise ValueError(
+                f"path {shown(self.name)}: arc_length does not increase at index {index}"
+            )
         uneven = np.abs(steps - self.spacing) > 1e-6 * self.spacing + 1e-9 * self.arc_length[-1]
         if abs(self.arc_length[0]) > 1e-9 or uneven.any():
             raise ValueError(
-                f"path {self.name!r}: arc_length must start at 0 and be uniform "
+                f"path {shown(self.name)}: arc_length must start at 0 and be uniform "
                 f"(index {int(np.argmax(uneven)) + 1} is not)"
             )
         self._check_seam()
         if (self.speed < MINIMUM_SPEED).any():
             index = int(np.argmin(self.speed))
             raise ValueError(
-                f"path {self.name!r}: speed[{index}] is {self.speed[index]} m/s, "
+                f"path {shown(self.name)}: speed[{index}] is {self.speed[index]} m/s, "
                 f"at least {MINIMUM_SPEED} is needed"
             )
 
@@ -141,11 +144,12 @@ class ReferencePath:
             return
         gap = float(np.hypot(self.x[-1] - self.x[0], self.y[-1] - self.y[0]))
         if gap > SEAM_GAP:
-            raise ValueError(f"path {self.name!r}: closed, but its ends are {gap:.3g} m apart")
+            raise ValueError(f"path {shown(self.name)}: closed, but its ends are {gap:.3g} m apart")
         turns = (self.heading[-1] - self.heading[0]) / (2.0 * np.pi)
         if abs(turns - round(turns)) > SEAM_GAP:
             raise ValueError(
-                f"path {self.name!r}: closed, but it turns by {turns:.4f} turns, not whole ones"
+                f"path {shown(self.name)}: closed, but it turns by {turns:.4f} turns, "
+                "not whole ones"
             )
 
     @property

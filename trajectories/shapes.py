@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from trajectories.fileio import shown
 from trajectories.path import SPACING, ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
 
@@ -39,6 +40,8 @@ Fit = TypeVar("Fit")
 Derivatives: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 """x, y, their first and their second derivatives, each (n,)."""
 
+LONGEST = 30_000.0
+"""Longest path that is made, m: planning its speed takes a minute."""
 DEGREE = 5
 """Degree of the smoothing splines."""
 LEAST_KNOT_SPACING = 0.5
@@ -96,7 +99,7 @@ def parse(text: str) -> list[Segment]:
         match = _SEGMENT.match(part.strip())
         if match is None:
             raise ValueError(
-                f"segment {position} ({part.strip()!r}) is not 'S metres' or "
+                f"segment {position} ({shown(part.strip())}) is not 'S metres' or "
                 "'L|R degrees r metres [t metres] [a share]'"
             )
         try:
@@ -108,7 +111,9 @@ def parse(text: str) -> list[Segment]:
         except ValueError:
             numbers = {"bad": 0.0}
         if min(numbers.values()) <= 0:
-            raise ValueError(f"segment {position} ({part.strip()!r}): numbers must be positive")
+            raise ValueError(
+                f"segment {position} ({shown(part.strip())}): numbers must be positive"
+            )
         if "straight" in numbers:
             segments.append(Segment(length=numbers["straight"]))
             continue
@@ -174,9 +179,22 @@ def fit(
     return fitted
 
 
+def checked_length(length: float) -> float:
+    """Return a path's length, m.
+
+    Raises
+    ------
+    ValueError
+        If it is not a number from 0 to `LONGEST`.
+    """
+    if not 0.0 <= length <= LONGEST:
+        raise ValueError(f"a path of {length:.6g} m: lengths must be from 0 to {LONGEST:g} m")
+    return float(length)
+
+
 def grid(length: float, spacing: float = SPACING) -> Array:
     """Uniform arc lengths from 0 to `length`, with a spacing as near to `spacing` as fits."""
-    return np.linspace(0.0, length, max(round(length / spacing), 3) + 1)
+    return np.linspace(0.0, length, max(round(checked_length(length) / spacing), 3) + 1)
 
 
 def build(segments: Sequence[Segment]) -> Geometry:

@@ -8,12 +8,14 @@ fixed path, 2014, for the variable b; the linearisation of the jerk bound is thi
 """
 
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import linprog
 
+from trajectories.fileio import shown
 from trajectories.path import ReferencePath
 
 Array = NDArray[np.float64]
@@ -30,6 +32,10 @@ SEAM = 1e-6
 """Largest difference of the speeds at a lap's ends, m/s: a jerk of some mm/s^3."""
 MORE_LAPS = 4
 """Attempts with one more lap at either end until the ends of the middle one meet."""
+SMALLEST, LARGEST = 1e-3, 1e6
+"""Smallest and largest limit of a profile, in SI units."""
+LONGEST = 100_000.0
+"""m: longest path that is planned, all laps of a closed one included; it takes minutes."""
 CHATTER_WEIGHT = 2e-3
 """Weight of the L1 penalty on changes of acceleration; without it profiles chatter at the caps."""
 
@@ -56,6 +62,11 @@ class SpeedLimits:
     min_speed
         m/s; lower caps are raised to it, so that a kink slows the reference down but never stops
         it. The default is the lowest speed in the paper's constraint table.
+
+    Raises
+    ------
+    ValueError
+        If a limit is not a number from 0.001 to 1e6.
     """
 
     max_speed: float
@@ -67,6 +78,17 @@ class SpeedLimits:
     wheelbase: float = 5.0
     end_speed: float = 1.5
     min_speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            number = isinstance(value, Real) and not isinstance(value, bool)
+            if name == "max_deceleration" and value is None:
+                continue
+            if not (number and SMALLEST <= value <= LARGEST):
+                raise ValueError(
+                    f"speed limits: {name} must be from {SMALLEST:g} to {LARGEST:g}, "
+                    f"not {shown(value)}"
+                )
 
     @property
     def deceleration(self) -> float:
@@ -109,6 +131,8 @@ def plan_speed(
     ------
     RuntimeError
         If the linear programme finds no profile; the message contains the solver's.
+    ValueError
+        If the path, with the laps that it takes to reach full speed, is longer than `LONGEST`.
     """
     if closed:
         lap, n = spacing * (len(curvature) - 1), len(curvature) - 1
@@ -117,9 +141,12 @@ def plan_speed(
             0.5 * limits.max_speed / weakest + 2.0 * weakest / limits.max_jerk
         )
         before = max(int(np.ceil(run_up / lap)), 1)
+        _check_length((2 * before + 1) * lap)
         shares = np.broadcast_to(share, curvature.shape)
         # The jerk bound lets a stop affect speeds far away: add laps until the ends meet.
         for around in range(before, before + MORE_LAPS):
+            if around > before and (2 * around + 1) * lap > LONGEST:
+                break
             laps = np.append(np.tile(curvature[:-1], 2 * around + 1), curvature[-1])
             shared = np.append(np.tile(shares[:-1], 2 * around + 1), shares[-1])
             speed = plan_speed(laps, spacing, limits, share=shared)
@@ -128,8 +155,9 @@ def plan_speed(
                 break
         speed[-1] = speed[0]
         return speed
-    caps = speed_caps(curvature, spacing, limits, share)
     length = spacing * (len(curvature) - 1)
+    _check_length(length)
+    caps = speed_caps(curvature, spacing, limits, share)
     cells = max(int(np.ceil(length / GRID)), 8)
     coarse = np.linspace(0.0, length, cells + 1)
     fine = np.linspace(0.0, length, len(curvature))
@@ -142,6 +170,14 @@ def plan_speed(
     smoothed = _smooth(squared, fine * (cells / length))
     planned: Array = np.sqrt(np.minimum(smoothed, limits.max_speed**2))
     return planned
+
+
+def _check_length(length: float) -> None:
+    if not length <= LONGEST:
+        raise ValueError(
+            f"a speed profile over {length:.4g} m, laps to get up to speed included, is too long: "
+            f"at most {LONGEST:g} m are planned"
+        )
 
 
 def _smooth(values: Array, at: Array) -> Array:

@@ -71,6 +71,11 @@ class TextTable:
         return values
 
 
+def read_lines(file: str | Path) -> list[str]:
+    """Read the lines of a text file of at most `MOST_BYTES`; errors as in `fileio.read_bytes`."""
+    return read_text(file, MOST_BYTES).split("\n")
+
+
 def read_table(file: str | Path) -> TextTable:
     """Split a text file at `,` or `;`; its header may be a `#` comment or a line without numbers.
 
@@ -84,7 +89,7 @@ def read_table(file: str | Path) -> TextTable:
     header: tuple[str, ...] = ()
     rows: list[list[str]] = []
     lines: list[int] = []
-    for number, line in enumerate(read_text(file, MOST_BYTES).split("\n"), start=1):
+    for number, line in enumerate(read_lines(file), start=1):
         text = line.strip()
         if not text:
             continue

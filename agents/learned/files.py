@@ -11,19 +11,17 @@ A file that cannot be used is a ValueError of one line that names the file and s
 import hashlib
 import json
 import re
-import reprlib
-import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import safetensors
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from trajectories.fileio import write_atomically
+from trajectories.fileio import checked, parse_json, read_bytes, shown, write_atomically
 
 MOST_WEIGHTS = 64 * 2**20
 """Largest .safetensors that is written or read, bytes."""
@@ -50,9 +48,6 @@ FAMILIES: Mapping[str, str] = {
 
 BESIDE = re.compile(r"[^/\\:\x00-\x1f\x7f\ud800-\udfff]+\.safetensors")
 """Allowed names of a weights file: in the folder of its spec, on every operating system."""
-
-SHORT = reprlib.Repr()
-SHORT.maxstring = 80
 
 Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Weight (outputs, inputs) and bias (outputs,)."""
@@ -158,13 +153,8 @@ def read_spec(kind: Kind, file: Path) -> Spec:
     the values are not checked.
     """
     check_suffix(kind, file)
-    content = _content(file, MOST_SPEC, kind.noun)
-    try:
-        spec = parse_json(content.decode())
-    except UnicodeDecodeError:
-        raise ValueError(f"{file} is not JSON but binary: give a {kind.noun}'s NAME.json") from None
-    except ValueError as error:
-        raise ValueError(f"{file} is not a {kind.noun}'s JSON: {error}: copy it anew") from error
+    name = f"{kind.noun} {file}"
+    spec = checked(parse_json(_content(file, MOST_SPEC, kind.noun), name), dict[str, Any], name)
     form = spec.get("format")
     if form != kind.format:
         if family(form) in FAMILIES.keys() - {family(kind.format)}:
@@ -176,11 +166,7 @@ def read_spec(kind: Kind, file: Path) -> Spec:
     _check_keys(kind, file, "", spec, kind.keys | COMMON_KEYS)
     for name, keys in {**kind.objects, **OBJECTS}.items():
         _check_keys(kind, file, f"{name}.", spec[name], keys)
-    try:
-        unchanged = spec["digest"] == _digest(spec)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{file} is not a {kind.noun}'s JSON: {error}: copy it anew") from error
-    if not unchanged:
+    if spec["digest"] != _digest(spec):
         raise ValueError(
             f"{file} was changed since it was written: copy it anew, or write the {kind.noun} again"
         )
@@ -259,8 +245,8 @@ def format_of(file: Path, noun: str) -> object:
     """
     content = _content(file, MOST_SPEC, noun)
     try:
-        found = json.loads(content.decode())
-    except (ValueError, RecursionError):
+        found = parse_json(content, file, infinite=True)
+    except ValueError:
         return None
     return found.get("format") if isinstance(found, dict) else None
 
@@ -268,11 +254,6 @@ def format_of(file: Path, noun: str) -> object:
 def family(form: object) -> str:
     """Return a format without its version; "" if it is not a format."""
     return form.rpartition("/")[0] if isinstance(form, str) else ""
-
-
-def shown(value: object) -> str:
-    """Return the repr of a value from a file, shortened to fit on a line."""
-    return SHORT.repr(value)
 
 
 def canonical(value: object) -> str:
@@ -289,21 +270,11 @@ def _digest(spec: Spec) -> str:
 def _content(file: Path, most: int, noun: str) -> bytes:
     """Read a regular file of at most `most` bytes."""
     try:
-        status = file.stat()
-        if not stat.S_ISREG(status.st_mode):  # reading a pipe would block
-            raise ValueError(f"{file} is not a plain file: give a {noun}'s NAME.json")
-        if status.st_size > most:
-            raise ValueError(
-                f"{file}: {_too_large(status.st_size, most)}: it is no {noun} of this project"
-            )
-        with file.open("rb") as handle:
-            return handle.read(most)
-    except FileNotFoundError:
+        return read_bytes(file, most)
+    except ValueError as error:
         raise ValueError(
-            f"there is no file {file}: give the path of a {noun}, its .safetensors beside it"
+            f"{error}: give the path of a {noun}, its .safetensors beside it"
         ) from None
-    except OSError as error:
-        raise ValueError(f"cannot read {file}: {error.strerror}") from error
 
 
 def _too_large(size: int, most: int) -> str:
@@ -330,30 +301,8 @@ def plain_json(name: str, value: object) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         raise ValueError(f"{name} must be a mapping, not {type(value).__name__}")  # noqa: TRY004
     try:
-        return parse_json(json.dumps(dict(value), allow_nan=False))
+        text = json.dumps(dict(value), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{name} must be plain JSON with finite numbers: {error}") from error
-
-
-def parse_json(text: str) -> dict[str, Any]:
-    """Parse a JSON object; duplicate keys, NaN and infinity are a ValueError."""
-    try:
-        found = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse)
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-    if not isinstance(found, dict):
-        raise ValueError(f"a JSON {type(found).__name__}, not an object")  # noqa: TRY004
+    found: dict[str, Any] = parse_json(text, name)
     return found
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f"key {twice!r} twice")
-    return found
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not JSON")

@@ -22,11 +22,11 @@ from agents.learned.files import (
     plain_json,
     read_spec,
     read_tensors,
-    shown,
     write_files,
 )
 from lpv_track_env.observation import SCALARS, ObservationLayout
 from lpv_track_env.task import checked_period
+from trajectories.fileio import shown
 from trajectories.naming import choose
 
 Weights = NDArray[np.float32]

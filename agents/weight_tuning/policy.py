@@ -25,7 +25,6 @@ from agents.learned.files import (
     plain_json,
     read_spec,
     read_tensors,
-    shown,
     write_files,
 )
 from agents.learned.policy import (
@@ -41,6 +40,7 @@ from agents.weights import FORMAT as SCHEDULE
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.task import checked_period
+from trajectories.fileio import shown
 
 WEIGHT_POLICY = Kind(
     format="lpv-track-weights/1",

@@ -199,12 +199,13 @@ def read_times(file: Path) -> dict[str, list[float]]:
         If the file does not hold recorded times.
     """
     from experiments.run.computing import ComputingTimes
+    from trajectories.fileio import checked, read_json
 
     try:
-        recorded: dict[str, list[float]] = json.loads(file.read_text(encoding="utf-8"))
+        recorded = checked(read_json(file), dict[str, list[float]], file)
         for name in ("ekf", *SOLVERS):
             ComputingTimes("sequential", recorded[name], recorded[name], period=PERIOD)
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, ValueError) as error:
         raise ValueError(f"{file} does not hold recorded times: {error}") from error
     return recorded
 

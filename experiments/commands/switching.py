@@ -158,13 +158,15 @@ def _sources() -> str:
 
 def _kept(file: Path, result: dict[str, Any]) -> dict[str, Any]:
     """Return the arms of a file written by the same sources and settings; none without one."""
+    from trajectories.fileio import checked, read_json
+
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-        if all(content.get(key) == result[key] for key in ("experiment", "setup", "sources")):
-            return dict(content["arms"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        pass
-    return {}
+        content = checked(read_json(file), dict[str, Any], file)
+        arms = checked(content.get("arms"), dict[str, dict[str, Any]], file)
+    except ValueError:
+        return {}
+    same = all(content.get(key) == result[key] for key in ("experiment", "setup", "sources"))
+    return arms if same else {}
 
 
 def table(result: Mapping[str, Any]) -> Table:

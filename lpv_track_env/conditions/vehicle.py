@@ -10,7 +10,7 @@ from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, compiled_inverse_
 from lpv_track_env.conditions import WIND_LEVER, layout
 from lpv_track_env.draws import gaussian
 from lpv_track_env.integration import integrate
-from lpv_track_env.vehicle import GRAVITY
+from lpv_track_env.plausibility import GRAVITY
 from trajectories.compilation import compiled_in_place, compiled_internal
 
 Array = NDArray[Any]

@@ -44,10 +44,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, inverse_speed
+from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vehicle import (
     BMW_320I,
     FORD_ESCORT,
-    GRAVITY,
     PARAMETER_ORDER,
     VEHICLES,
     VW_VANAGON,

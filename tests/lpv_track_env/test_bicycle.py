@@ -18,7 +18,8 @@ from lpv_track_env.bicycle import (
     compiled_inverse_speed,
     derivative,
 )
-from lpv_track_env.vehicle import COURSE_CAR, GRAVITY, M2_MINIBUS, VEHICLES, VehicleParameters
+from lpv_track_env.plausibility import GRAVITY
+from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES, VehicleParameters
 
 Array = NDArray[np.float64]
 

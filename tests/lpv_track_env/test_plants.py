@@ -22,8 +22,9 @@ from lpv_track_env import plants
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, derivative
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.integration import integrate
+from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vector_env import PathTrackingVectorEnv
-from lpv_track_env.vehicle import BMW_320I, GRAVITY, M2_MINIBUS, VEHICLES, VehicleParameters
+from lpv_track_env.vehicle import BMW_320I, M2_MINIBUS, VEHICLES, VehicleParameters
 
 pytest.importorskip("vehiclemodels")
 from vehiclemodels.utils import tire_model

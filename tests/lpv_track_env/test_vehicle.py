@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 from scipy.optimize import fsolve
 
 from lpv_track_env import vehicle
-from lpv_track_env.bicycle import derivative
+from lpv_track_env.bicycle import derivative, fastest_pole
+from lpv_track_env.plausibility import FASTEST_POLE, INVERSE_SPEED_AT_STANDSTILL
 from lpv_track_env.vehicle import (
     COURSE_CAR,
     M2_MINIBUS,
@@ -18,6 +20,7 @@ from lpv_track_env.vehicle import (
     VehicleParameters,
 )
 
+SHARED = Path(__file__).parents[3] / "shared" / "cases"
 PRESETS = pytest.mark.parametrize(("name", "car"), VEHICLES.items(), ids=VEHICLES.keys())
 POSITIVE = (
     "mass", "yaw_inertia", "front_axle_distance", "rear_axle_distance",
@@ -162,7 +165,7 @@ def test_json_file_takes_its_name_and_defaults(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"mass": -3500.0}, "mass must be positive"),
-        ({"mass": math.nan}, "mass must be positive"),
+        ({"mass": math.nan}, "NaN is no number"),
         ({"wheelbase": 3.3}, "unknown field 'wheelbase'; known:.*'front_axle_distance'"),
         ({"mass": "heavy"}, "van.json: vehicle 'm2-minibus': mass must be"),
         ({"mass": None}, "van.json: vehicle 'm2-minibus': mass must be"),
@@ -185,17 +188,139 @@ def test_missing_field_in_a_file_is_named(tmp_path: Path) -> None:
 
 
 def test_unreadable_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"cannot read vehicle file .*none\.json: No such file"):
+    with pytest.raises(ValueError, match=r"none\.json: cannot be read: No such file"):
         vehicle.load(tmp_path / "none.json")
     (tmp_path / "folder.json").mkdir()
-    with pytest.raises(ValueError, match=r"cannot read vehicle file .*folder\.json"):
+    with pytest.raises(ValueError, match=r"folder\.json: cannot be read: Is a directory"):
         vehicle.load(tmp_path / "folder.json")
     file = tmp_path / "broken.json"
     for content in (b'{"mass": 1', b"\xff\xfe\xfa"):
         file.write_bytes(content)
-        with pytest.raises(ValueError, match=r"broken\.json is not JSON"):
+        with pytest.raises(ValueError, match=r"broken\.json: is not (JSON|a text file)"):
             vehicle.load(file)
     for content in ("[1, 2]", "3", '"van"'):
         file.write_text(content)
         with pytest.raises(ValueError, match=r"broken\.json must hold one JSON object"):
             vehicle.load(file)
+
+
+ORCA = VehicleParameters(
+    "1:43 model car", "MPCC literature", 0.041, 27.8e-6, 0.029, 0.033, 0.594, 0.746, 0.01,
+    length=0.12, width=0.05,
+)  # fmt: skip
+MODEL_CAR = VehicleParameters(
+    "1:10 model car", "3 kg, wheelbase 0.33 m", 3.0, 0.04, 0.165, 0.165, 60.0, 60.0, 0.01,
+    max_steering_angle=0.42, max_steering_rate=3.2, acceleration_range=(-9.5, 9.5), max_jerk=100.0,
+    length=0.58, width=0.31,
+)  # fmt: skip
+TRUCK = VehicleParameters(
+    "truck of 40 t", "a tractor and its trailer as one body", 4e4, 2.5e5, 3.5, 2.6, 4e5, 1.2e6,
+    0.008, max_steering_angle=0.8, length=16.5, width=2.55,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("car", [ORCA, MODEL_CAR, TRUCK, *VEHICLES.values()], ids=lambda c: c.name)
+def test_vehicles_of_every_size_are_plausible(car: VehicleParameters, tmp_path: Path) -> None:
+    assert not car.implausible
+    assert "implausible" not in car.as_dict()
+    assert vehicle.load(written(tmp_path, car.as_dict())) == car
+    # The bound on what can be computed really bounds the poles.
+    p = car
+    damping = INVERSE_SPEED_AT_STANDSTILL * (
+        (p.front_cornering_stiffness + p.rear_cornering_stiffness) / p.mass
+        + (p.front_cornering_stiffness * p.front_axle_distance**2
+           + p.rear_cornering_stiffness * p.rear_axle_distance**2) / p.yaw_inertia
+    )  # fmt: skip
+    assert 0.4 * damping < fastest_pole(0.0, car) <= damping < 0.2 * FASTEST_POLE
+
+
+@pytest.mark.parametrize("name", ["f1tenth", "kart"])
+def test_vehicles_that_others_have_sent_are_plausible(name: str) -> None:
+    file = SHARED / f"{name}.json"
+    if not file.exists():
+        pytest.skip(f"{file} is not there")
+    assert vehicle.load(file).name == name
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"max_steering_angle": 35}, "35 rad .* 0.01 to 1.571; deg[?] 35 deg = 0.6109 rad"),
+        ({"max_steering_angle": 1e4}, "10000 rad is implausible, expected 0.01 to 1.571 [(]"),
+        ({"max_steering_rate": 30}, "deg/s[?] 30 deg/s = 0.5236 rad/s"),
+        ({"front_cornering_stiffness": 1570.0}, "N/deg[?] 1570 N/deg = 8.995e[+]04 N/rad"),
+        ({"rear_cornering_stiffness": 110.0}, "kN/rad[?] 110 kN/rad = 1.1e[+]05 N/rad"),
+        ({"mass": 3.5}, "is implausible.* is the mass 3.5 kg[?]"),
+        ({"mass": 1e-9}, "mass 1e-09 kg is implausible"),
+        ({"yaw_inertia": 1e-9}, "yaw_inertia 1e-09 kg m.2 is implausible"),
+        ({"front_axle_distance": 1600}, "front_axle_distance 1600 m .*mm[?] 1600 mm = 1.6 m"),
+        ({"rear_axle_distance": 170}, "cm[?] 170 cm = 1.7 m"),
+        ({"width": 2000}, "mm[?] 2000 mm = 2 m"),
+        ({"rolling_resistance": 2}, "%[?] 2 % = 0.02"),
+        ({"speed_range": [1, 120]}, "km/h[?] 120 km/h = 33.33 m/s"),
+        ({"acceleration_range": [-5000, 3500]}, "acceleration_range -5000 m/s.2 is implausible"),
+    ],
+)
+def test_values_in_other_units_are_refused_unless_told(
+    tmp_path: Path, change: dict[str, object], message: str
+) -> None:
+    file = written(tmp_path, {**M2_MINIBUS.as_dict(), **change})
+    with pytest.raises(ValueError, match=message) as caught:
+        vehicle.load(file)
+    assert '"implausible": true takes it as it is' in str(caught.value)
+    with pytest.raises(ValueError, match=message):
+        M2_MINIBUS.replace(**change)
+
+
+def test_an_implausible_vehicle_says_so(tmp_path: Path) -> None:
+    values = {**M2_MINIBUS.as_dict(), "max_steering_angle": 35, "implausible": True}
+    car = vehicle.load(written(tmp_path, values))
+    assert car.max_steering_angle == 35
+    assert car.as_dict() == {**values, "speed_range": (1.0, 30.0), **{
+        key: getattr(M2_MINIBUS, key)
+        for key in ("acceleration_range", "longitudinal_acceleration_range")
+    }}  # fmt: skip
+    assert car.replace(mass=3000.0).implausible
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mass": 1e-6}, "at a rate of 3.75e[+]11 1/s, at most 10000 1/s .* mass 1e-06 kg"),
+        ({"yaw_inertia": 1e-6}, "at a rate of .* yaw_inertia 1e-06 kg"),
+        ({"front_cornering_stiffness": 1e9}, "stiffnesses 1e[+]09 and 110000 N/rad"),
+        ({"front_cornering_stiffness": 1e15}, "is 1e[+]15; 1e-09 to 1e[+]09 can be"),
+        ({"mass": 1e-310}, "mass is 1e-310; 1e-09 to"),
+        ({"max_jerk": 1e308}, "max_jerk is 1e[+]308"),
+        ({"speed_range": (-1e300, 1.0)}, "speed_range is -1e[+]300"),
+    ],
+)
+def test_what_cannot_be_integrated_is_refused_in_any_case(
+    change: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        M2_MINIBUS.replace(implausible=True, **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mass": True}, "mass must be positive, not True"),
+        ({"mass": 10**400}, "mass must be positive, not an integer of 1329 bits"),
+        ({"mass": "m" * 500_000}, "mass must be positive, not 'mmm"),
+        ({"name": 3}, "name must be a text line, not 3"),
+        ({"name": "a\nb"}, "name must be a text line"),
+        ({"source": None}, "source must be a text line"),
+        ({"implausible": 1}, "implausible must be true or false, not 1"),
+    ],
+)
+def test_values_of_wrong_types_are_one_short_line(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        M2_MINIBUS.replace(**change)
+    assert len(str(caught.value)) < 300
+
+
+def test_a_pipe_is_no_vehicle(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.json")
+    with pytest.raises(ValueError, match="no regular file"):
+        vehicle.load(tmp_path / "pipe.json")

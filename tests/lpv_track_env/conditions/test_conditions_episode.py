@@ -16,7 +16,8 @@ from lpv_track_env.conditions import IDEAL, REALTIME, WIND_LEVER, Conditions
 from lpv_track_env.conditions import layout as conditions_layout
 from lpv_track_env.conditions.vehicle import AIR_DENSITY, secant
 from lpv_track_env.env import PathTrackingEnv
-from lpv_track_env.vehicle import GRAVITY, VEHICLES
+from lpv_track_env.plausibility import GRAVITY
+from lpv_track_env.vehicle import VEHICLES
 
 Array = NDArray[np.float64]
 
