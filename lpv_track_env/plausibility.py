@@ -111,7 +111,7 @@ def check_plausible(values: Mapping[str, Any]) -> None:
             hints.append(f"; is the mass {mass:g} kg?" if mass < 100.0 else "")
         raise ValueError(
             f"vehicle {shown(values['name'])}: {key} {value:g} {unit}".rstrip()
-            + f" is implausible, expected {low:.4g} to {high:.4g}{(hints or [''])[0]} "
+            + f" is implausible, expected {low:.4g} to {high:.4g}{''.join(hints)} "
             '("implausible": true takes it as it is)'
         )
 
