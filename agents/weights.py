@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trajectories import CurvatureBands, ReferencePath
-from trajectories.fileio import read_json, shortened, shown, write_atomically
+from trajectories.arguments import shortened, shown
+from trajectories.fileio import read_json, write_atomically
 from trajectories.naming import choose
 
 Array = NDArray[np.float64]

@@ -2,12 +2,13 @@
 
 import argparse
 import importlib
+import io
 import os
 import sys
 from collections.abc import Collection, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
-from experiments.commands.options import EXIT_INTERRUPTED, EXIT_USAGE
+from experiments.commands.options import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
 from experiments.run.engines import one_thread
 
 COMMANDS = {
@@ -36,13 +37,34 @@ COMMANDS = {
 """Commands and their summaries; a command's module is `experiments.commands.NAME`."""
 
 
+LONGEST_LINE = 350
+"""Characters of the longest error message."""
+LONGEST_WORD = 60
+"""Characters of a user's word that a message repeats."""
+
+
 class Parser(argparse.ArgumentParser):
-    """Parser for options with two names: `--traj` is short for both, not ambiguous."""
+    """Parser whose errors are one line, and that knows options with two names.
+
+    `--traj` is short for both names of an option, not ambiguous.
+    """
 
     def _get_option_tuples(self, option_string: str) -> list[Any]:
         # Python 3.11 refuses a prefix of two names even if they belong to one option.
         found = super()._get_option_tuples(option_string)
         return list({option[0]: option for option in found}.values())
+
+    def error(self, message: str) -> NoReturn:
+        """Raise a ValueError, which is one line, in place of the usage and an exit."""
+        raise ValueError(f"{_short(message)}; {self.prog} --help lists the options")
+
+
+def _short(message: str) -> str:
+    """Return a message of argparse with its long words, which are the user's, cut."""
+    return " ".join(
+        word if len(word) <= LONGEST_WORD else f"{word[:LONGEST_WORD]}..."
+        for word in message.split()
+    )
 
 
 def module_of(command: str) -> Any:
@@ -87,11 +109,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run `lpv-track`; errors that the user can correct are one line and EXIT_USAGE."""
     # Before any numerical library is imported.
     one_thread()
+    _open_streams()
     given = sys.argv[1:] if arguments is None else arguments
     try:
-        return run(parser(given[:1]).parse_args(given))
+        code = run(parser(given[:1]).parse_args(given))
+        sys.stdout.flush()
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        print("lpv-track:", " ".join(str(error).split()), file=sys.stderr)
+        if _output_lost():
+            return EXIT_FAILED
+        from trajectories.arguments import shortened
+
+        print("lpv-track:", shortened(error), file=sys.stderr)
         return EXIT_USAGE
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+    return code
+
+
+def _open_streams() -> None:
+    """Make the standard streams usable: closed ones lead nowhere, any character can be printed."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
+        elif isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")
+
+
+def _output_lost() -> bool:
+    """Return whether standard output can no longer be written, as a pipe whose reader has ended.
+
+    What is left to be written is then dropped, so that the end of the process says nothing of it.
+    """
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError) as error:
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 1)
+        os.close(null)
+        if not isinstance(error, BrokenPipeError):
+            print("lpv-track: standard output cannot be written:", error, file=sys.stderr)
+        return True
+    return False

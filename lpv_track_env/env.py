@@ -21,7 +21,14 @@ from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.plants import PlantEpisode
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.task import Task, action_space, checked_period, reference
-from lpv_track_env.validation import check_finite, given_start, names_unknown, two_numbers
+from lpv_track_env.validation import (
+    check_finite,
+    checked_options,
+    checked_seed,
+    given_start,
+    names_unknown,
+    two_numbers,
+)
 from lpv_track_env.vehicle import VehicleParameters
 from lpv_track_env.vehicle import load as load_vehicle
 from trajectories import ReferencePath
@@ -183,12 +190,12 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             vehicle=car,
             control_period=period,
             layout=ObservationLayout(
-                preview_steps, period if preview_period is None else float(preview_period)
+                preview_steps, period if preview_period is None else preview_period
             ),
-            reward_weights=reward_weights or RewardWeights(),
-            max_lateral_error=float(max_lateral_error),
+            reward_weights=RewardWeights() if reward_weights is None else reward_weights,
+            max_lateral_error=max_lateral_error,
             time_limit=time_limit,
-            initial_error_range=tuple(float(half) for half in initial_error_range),
+            initial_error_range=initial_error_range,
             random_start=random_start,
             conditions=load_conditions(conditions),
         )
@@ -321,9 +328,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin an episode; see the class for `options`."""
-        options = dict(options or {})
-        for key in options:
-            choose("reset option", key, RESET_OPTIONS)
+        options, seed = checked_options(options, RESET_OPTIONS), checked_seed(seed)
         task = self.episode_task(options)
         given = given_start(options, task.path.length)
         plant = self._plant_of(task)

@@ -31,6 +31,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from trajectories.arguments import Number, Whole, check_fields
+
 SCALARS = (
     ("longitudinal_speed", "m/s", 100.0),
     ("lateral_speed", "m/s", 100.0),
@@ -75,6 +77,14 @@ class TrackingObservation(NamedTuple):
     preview_speed: Array
 
 
+MOST_STEPS = 1000
+"""Largest number of preview nodes; every step of an environment computes all of them."""
+RULES: dict[str, Number | Whole] = {
+    "preview_steps": Whole(1, MOST_STEPS),
+    "preview_period": Number(0.0, 10.0, "s", above=True),
+}
+
+
 @dataclass(frozen=True)
 class ObservationLayout:
     """Names, units, slices and bounds of the observation vector.
@@ -89,17 +99,15 @@ class ObservationLayout:
     Raises
     ------
     ValueError
-        If there is no preview node or the period is not positive.
+        If there is no preview node or there are more than `MOST_STEPS`, or the period is out of
+        range.
     """
 
     preview_steps: int = 20
     preview_period: float = 0.05
 
     def __post_init__(self) -> None:
-        if self.preview_steps < 1:
-            raise ValueError(f"preview_steps must be at least 1, not {self.preview_steps}")
-        if not 0.0 < self.preview_period <= 10.0:
-            raise ValueError(f"preview_period must be in (0, 10] s, not {self.preview_period}")
+        check_fields(self, RULES)
 
     @property
     def size(self) -> int:

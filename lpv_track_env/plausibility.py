@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from trajectories.fileio import shown
+from trajectories.arguments import shown
 
 GRAVITY = 9.81  # m/s^2
 

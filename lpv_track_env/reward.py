@@ -20,10 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trajectories.arguments import Number, check_fields
 from trajectories.compilation import compiled_internal
 
 TERMS = ("progress", "lateral", "heading", "speed", "input_rate", "end")
 """Order of the reward's terms."""
+WEIGHT, SCALE = Number(0.0, 1e9), Number(1e-6, 1e9)
+"""Bounds of weights and scales: within them the reward of any state is finite."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,10 @@ class RewardWeights:
     steering_rate_scale: float = 0.5
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            smallest = np.nextafter(0.0, 1.0) if field.name.endswith("_scale") else 0.0
-            if not (np.isfinite(value) and value >= smallest):
-                raise ValueError(f"reward weight {field.name} must not be {value!r}")
+        rules = {
+            field.name: SCALE if field.name.endswith("_scale") else WEIGHT for field in fields(self)
+        }
+        check_fields(self, rules, prefix="reward weight ")
 
     def as_array(self) -> NDArray[np.float64]:
         """Return weights and scales in field order, shape (11,), as `terms` takes them."""

@@ -15,8 +15,10 @@ from lpv_track_env.bicycle import longest_substep
 from lpv_track_env.conditions import Conditions
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.reward import RewardWeights
+from lpv_track_env.validation import LARGEST_ERROR
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
+from trajectories.arguments import Number, flag, instance_of, numbers
 from trajectories.naming import choose
 from trajectories.projection import tightest_turn
 from trajectories.speed import constant_speed
@@ -26,12 +28,19 @@ SPEED_MODES = ("variable", "fixed")
 Array = NDArray[np.float64]
 
 
+PERIOD = Number(0.001, 1.0, "s")
+"""Rule of a control period."""
+CORRIDOR = Number(0.0, math.inf, "m", above=True)
+SPEED = Number(0.0, 1000.0, "m/s", above=True)
+TIME_LIMIT = Number(0.0, 1e6, "s", above=True)
+"""Rule of a time limit; at its end, 11 days, a vehicle that stands still would be forgotten."""
+ERROR_RANGE = Number(0.0, LARGEST_ERROR)
+"""Rule of the half of a range of initial errors: m, rad, m/s."""
+
+
 def checked_period(value: float) -> float:
     """Return a control period (s) as a float, or raise a ValueError if it makes no sense."""
-    period = float(value)
-    if not 0.001 <= period <= 1.0:
-        raise ValueError(f"control_period must be in [0.001, 1] s, not {value}")
-    return period
+    return PERIOD.of("control_period", value)
 
 
 def reference(
@@ -44,9 +53,9 @@ def reference(
     path = trajectories.load(trajectory)
     choose("speed_mode", speed_mode, SPEED_MODES)
     if speed_mode == "fixed":
-        speed = constant_speed(path) if fixed_speed is None else float(fixed_speed)
-        if not (math.isfinite(speed) and speed > 0):
-            raise ValueError(f"fixed_speed must be positive, not {fixed_speed!r} m/s")
+        speed = (
+            constant_speed(path) if fixed_speed is None else SPEED.of("fixed_speed", fixed_speed)
+        )
         path = path.with_speed(speed, speed_mode="fixed")
     elif fixed_speed is not None:
         raise ValueError("fixed_speed needs speed_mode='fixed'")
@@ -85,15 +94,19 @@ class Task:
     """None under "simulation"."""
 
     def __post_init__(self) -> None:
-        checked_period(self.control_period)
-        if not self.max_lateral_error > 0:
-            raise ValueError(f"max_lateral_error must be positive, not {self.max_lateral_error} m")
-        if len(self.initial_error_range) != 3 or not all(
-            0.0 <= half < math.inf for half in self.initial_error_range
-        ):
-            raise ValueError("initial_error_range must be three numbers >= 0: m, rad, m/s")
-        if self.time_limit is not None and not 0 < self.time_limit < math.inf:
-            raise ValueError(f"time_limit must be positive and finite, not {self.time_limit} s")
+        instance_of("reward_weights", self.reward_weights, RewardWeights, "RewardWeights")
+        checked = {
+            "control_period": checked_period(self.control_period),
+            "max_lateral_error": CORRIDOR.of("max_lateral_error", self.max_lateral_error),
+            "initial_error_range": numbers(
+                "initial_error_range", self.initial_error_range, ERROR_RANGE, 3
+            ),
+            "random_start": flag("random_start", self.random_start),
+        }
+        if self.time_limit is not None:
+            checked["time_limit"] = TIME_LIMIT.of("time_limit", self.time_limit)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
 
     @property
     def substeps(self) -> int:

@@ -6,7 +6,6 @@ A check returns the value in the form that its caller works with, or raises an e
 import functools
 import inspect
 import math
-import operator
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ParamSpec
@@ -18,12 +17,17 @@ from numpy.typing import NDArray
 
 from lpv_track_env.episodes import GIVEN
 from lpv_track_env.kernels import first_not_finite
+from trajectories.arguments import Number, Whole, shown
 from trajectories.naming import choose
 
 Array = NDArray[Any]
 
 ENTRIES = ("0 (acceleration)", "1 (steering angle)")
 NUMBERS = (float, int)
+LARGEST_ERROR = 1e15
+"""Largest initial error, m, rad, m/s: within it all that an episode computes is finite."""
+ERROR = Number(-LARGEST_ERROR, LARGEST_ERROR)
+SEED = Whole(0, 2**63 - 1)
 
 P = ParamSpec("P")
 
@@ -110,9 +114,10 @@ def two_numbers(action: Any) -> tuple[float, float]:
         if not (type(values) is list and type(a) in NUMBERS and type(delta) in NUMBERS):
             raise TypeError
         return float(a), float(delta)
-    except (TypeError, ValueError, OverflowError):
+    except Exception:  # noqa: BLE001  conversions of a user's object may raise anything
         raise ValueError(
-            f"action must be two numbers [acceleration m/s^2, steering angle rad], not {action!r}"
+            "action must be two numbers [acceleration m/s^2, steering angle rad], not "
+            f"{shown(action)}"
         ) from None
 
 
@@ -120,7 +125,7 @@ def check_finite(a: float, delta: float, action: Any) -> None:
     """Raise a ValueError that names the first entry of an action that is not finite, if any."""
     for value, entry in zip((a, delta), ENTRIES, strict=True):
         if not math.isfinite(value):
-            raise ValueError(f"action entry {entry} is not finite: {action!r}")
+            raise ValueError(f"action entry {entry} is not finite: {shown(action)}")
 
 
 def check_action(action: Any) -> None:
@@ -143,8 +148,8 @@ def checked_actions(actions: Any, ends: Array, skips_ended: bool) -> Array:
     shape = (len(ends), 2)
     try:
         given = np.asarray(actions)
-    except ValueError:
-        given = np.empty(0)
+    except Exception:  # noqa: BLE001  conversions of a user's object may raise anything
+        given = np.empty(0, dtype=object)
     if given.shape != shape or given.dtype.kind not in "fiu":
         raise ValueError(
             f"actions must be an array {shape} of numbers [acceleration m/s^2, steering angle "
@@ -156,7 +161,7 @@ def checked_actions(actions: Any, ends: Array, skips_ended: bool) -> Array:
         index, entry = divmod(bad, 2)
         raise ValueError(
             f"action of environment {index}, entry {ENTRIES[entry]}, is not finite: "
-            f"{given[index]!r}"
+            f"{shown(given[index])}"
         )
     return commands
 
@@ -186,15 +191,42 @@ def checked_seeds(seed: Any, num_envs: int) -> Sequence[int | None]:
     Raises
     ------
     ValueError
-        For a list of another length.
+        For a list of another length, or anything but whole numbers >= 0 and None.
     """
-    if seed is None:
-        return [None] * num_envs
-    if not isinstance(seed, Sequence):
-        return [operator.index(seed) + i for i in range(num_envs)]
+    if not isinstance(seed, Sequence) or isinstance(seed, str | bytes):
+        first = checked_seed(seed)
+        return [None if first is None else first + i for i in range(num_envs)]
     if len(seed) != num_envs:
         raise ValueError(f"{len(seed)} seeds for num_envs={num_envs}: give one for each")
-    return list(seed)
+    return [checked_seed(one) for one in seed]
+
+
+def checked_seed(seed: Any) -> int | None:
+    """Return a seed as an int; None stays None.
+
+    Raises
+    ------
+    ValueError
+        For anything but a whole number >= 0.
+    """
+    return None if seed is None else SEED.of("seed", seed)
+
+
+def checked_options(options: Any, known: tuple[str, ...]) -> dict[str, Any]:
+    """Return reset options as a dictionary; None stands for none.
+
+    Raises
+    ------
+    ValueError
+        For another type, or an unknown option; the message lists the known ones and the nearest.
+    """
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise ValueError(f"options must be a dictionary or None, not {shown(options)}")  # noqa: TRY004
+    for key in options:
+        choose("reset option", key, known)
+    return dict(options)
 
 
 def listed(kind: str, value: Any) -> list[Any]:
@@ -222,13 +254,14 @@ def checked_threads(value: int) -> int:
     ValueError
         For fewer than one, or more than numba sees processors.
     """
-    threads = operator.index(value)
     most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-    if not 1 <= threads <= most:
+    try:
+        threads = Whole(1, most).of("threads", value)
+    except ValueError:
         raise ValueError(
             f"threads must be from 1 to {most} (the processors numba sees; NUMBA_NUM_THREADS sets "
-            f"it), not {value}"
-        )
+            f"it), not {shown(value)}"
+        ) from None
     if threads > 1:
         # Waiting threads would spin otherwise: on a busy machine a step then takes 700 times as
         # long.
@@ -248,13 +281,6 @@ def given_start(options: Mapping[str, Any], length: float) -> NDArray[np.float64
     for k, key in enumerate(GIVEN):
         if key not in options:
             continue
-        try:
-            value = float(options[key])
-        except (TypeError, ValueError):
-            value = math.nan
-        if not math.isfinite(value):
-            raise ValueError(f"reset option {key} must be a finite number, not {options[key]!r}")
-        if key == "arc_length" and not 0.0 <= value <= length:
-            raise ValueError(f"option arc_length must be in [0, {length:.2f}] m, not {value}")
-        start[k] = value
+        rule = Number(0.0, length, "m") if key == "arc_length" else ERROR
+        start[k] = rule.of(f"reset option {key}", options[key])
     return start

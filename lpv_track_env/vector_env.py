@@ -1,6 +1,5 @@
 """Many path tracking environments stepped at once, in compiled code."""
 
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -20,6 +19,7 @@ from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.plants import BICYCLE
 from lpv_track_env.task import Task, action_space
 from lpv_track_env.vector_kernels import ConditionArrays, EnvArrays, StepArrays
+from trajectories.arguments import Whole
 from trajectories.compilation import entry_point
 from trajectories.naming import choose
 
@@ -31,6 +31,9 @@ MODES = {
     AutoresetMode.SAME_STEP: vector_kernels.SAME_STEP,
     AutoresetMode.DISABLED: vector_kernels.DISABLED,
 }
+
+NUM_ENVS = Whole(1, 1_000_000)
+"""Rule of the number of environments; a million take some gigabytes."""
 
 EPISODE = 1
 """Column of an episode's number in `EnvArrays.draws`."""
@@ -105,8 +108,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int = 1,
     ) -> None:
-        if operator.index(num_envs) < 1:
-            raise ValueError(f"num_envs must be at least 1, not {num_envs}")
+        self.num_envs = NUM_ENVS.of("num_envs", num_envs)
         if (plant := settings["plant"]) != BICYCLE:
             raise ValueError(
                 f"the compiled vector environment drives plant={BICYCLE!r} only, not {plant!r}: "
@@ -117,7 +119,6 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             choose("render_mode", self.render_mode, tuple(self.metadata["render_modes"]))
         paths = validation.listed("trajectory", settings["trajectory"])
         cars = validation.listed("vehicle", settings["vehicle"])
-        self.num_envs = operator.index(num_envs)
         self.single = PathTrackingEnv(**settings | {"trajectory": paths[0], "vehicle": cars[0]})
         """A single environment with the same settings, first path and first vehicle, for agents."""
         self.autoreset_mode = validation.checked_mode(autoreset_mode)

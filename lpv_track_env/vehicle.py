@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.plausibility import GRAVITY, check_computable, check_plausible
-from trajectories.fileio import read_json, shortened, shown
+from trajectories.arguments import instance_of, shortened, shown
+from trajectories.fileio import read_json
 from trajectories.naming import suggestion
 
 PARAMETER_ORDER = (
@@ -297,13 +298,16 @@ def load(vehicle: str | Path | VehicleParameters) -> VehicleParameters:
     """
     if isinstance(vehicle, VehicleParameters):
         return vehicle
-    if str(vehicle) in VEHICLES:
-        return VEHICLES[str(vehicle)]
-    path = Path(vehicle)
+    name = str(
+        instance_of("vehicle", vehicle, str | Path, "a name, a .json file or VehicleParameters")
+    )
+    if name in VEHICLES:
+        return VEHICLES[name]
+    path = Path(name)
     if path.suffix == ".json":
         return _read(path)
     raise ValueError(
-        f"unknown vehicle {shown(str(vehicle))}; {suggestion(vehicle, VEHICLES)}, "
+        f"unknown vehicle {shown(name)}; {suggestion(name, VEHICLES)}, "
         "or give a .json file with the fields of VehicleParameters"
     )
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trajectories import files, shapes
+from trajectories.arguments import instance_of, shown
 from trajectories.curvature import PathStatistics, signed_waypoint_curvature
-from trajectories.fileio import shown
 from trajectories.naming import suggestion
 from trajectories.path import SPACING, ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
@@ -100,12 +100,8 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
     """
     if isinstance(trajectory, ReferencePath):
         return trajectory
-    if not isinstance(trajectory, str | Path):
-        raise TypeError(
-            f"a trajectory is a name, a file or a ReferencePath, not {type(trajectory).__name__}: "
-            "trajectories.ReferencePath takes arrays"
-        )
-    name = str(trajectory)
+    words = "a name, a file or a ReferencePath"
+    name = str(instance_of("trajectory", trajectory, str | Path, words))
     if name in PUBLISHED:
         return _drivable(name)
     if name.endswith("-raw") and name[:-4] in PUBLISHED:

@@ -8,13 +8,14 @@ ValueError of one line that begins with the file's name.
 import json
 import math
 import os
-import reprlib
 import secrets
 import stat
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import msgspec
+
+from trajectories.arguments import shortened, shown
 
 Value = TypeVar("Value")
 
@@ -24,32 +25,6 @@ DEEPEST = 32
 """Largest number of JSON objects and lists inside each other."""
 LARGEST_INTEGER = 2**63 - 1
 """Largest integer in JSON, as in a 64-bit integer of NumPy."""
-
-
-class _Short(reprlib.Repr):
-    """Reprs that fit on a line; Python refuses to write integers of 4300 digits."""
-
-    def repr_int(self, x: int, level: int) -> str:
-        if x.bit_length() > 512:
-            return f"an integer of {x.bit_length()} bits"
-        return super().repr_int(x, level)
-
-
-SHORT = _Short()
-SHORT.maxstring = SHORT.maxother = 80
-
-
-def shown(value: object) -> str:
-    """Return the repr of a value that anybody may have given, shortened to one line."""
-    return shortened(SHORT.repr(value), 120)
-
-
-def shortened(text: object, most: int = 200) -> str:
-    """Return a text as one printable line; the middle of a text longer than `most` is left out."""
-    line = " ".join(str(text).split())
-    if len(line) > most:
-        line = f"{line[: most // 2]} ... {line[-most // 3 :]}"
-    return line if line.isprintable() else ascii(line)[1:-1]
 
 
 def read_bytes(file: str | Path, limit: int = MOST_BYTES) -> bytes:

@@ -16,8 +16,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from trajectories.arguments import shortened, shown
 from trajectories.curvature import circle_curvature, signed_waypoint_curvature, statistics
-from trajectories.fileio import checked, parse_json, shortened, shown, write_atomically
+from trajectories.fileio import checked, parse_json, write_atomically
 from trajectories.importers import read_gps, read_racetrack, read_xy
 from trajectories.path import ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed

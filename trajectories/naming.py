@@ -3,10 +3,10 @@
 import difflib
 from collections.abc import Iterable
 
-from trajectories.fileio import shown
+from trajectories.arguments import shown
 
-LONGEST = 100
-"""Characters of a name that are compared."""
+LONGEST_NAME = 100
+"""Characters of a name that is compared with the known ones."""
 
 
 def choose(kind: str, value: str, known: tuple[str, ...]) -> str:
@@ -17,7 +17,7 @@ def choose(kind: str, value: str, known: tuple[str, ...]) -> str:
     ValueError
         If it is not, listing the known names of this `kind` and the nearest.
     """
-    if value in known:
+    if isinstance(value, str) and value in known:
         return value
     raise ValueError(f"unknown {kind} {shown(value)}; {suggestion(value, known)}")
 
@@ -25,5 +25,7 @@ def choose(kind: str, value: str, known: tuple[str, ...]) -> str:
 def suggestion(value: object, known: Iterable[str], more: str = "") -> str:
     """Second half of an error message: the known names, `more` after them, and the nearest."""
     names = tuple(known)
-    nearest = difflib.get_close_matches(str(value)[:LONGEST], names, n=1, cutoff=0.0)[0]
+    # A long name has no near one, and to look for it takes the product of the lengths.
+    given = value if isinstance(value, str) else shown(value)
+    nearest = difflib.get_close_matches(given[:LONGEST_NAME], names, n=1, cutoff=0.0)[0]
     return f"known: {', '.join(names)}{more} (nearest: {nearest})"

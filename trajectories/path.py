@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trajectories import projection, table
-from trajectories.fileio import shown
+from trajectories.arguments import shown
 
 SPACING = 0.25
 """m between nodes of every path, up to fitting its length exactly."""

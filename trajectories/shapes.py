@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from trajectories.fileio import shown
+from trajectories.arguments import shown
 from trajectories.path import SPACING, ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
 

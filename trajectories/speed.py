@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import linprog
 
-from trajectories.fileio import shown
+from trajectories.arguments import shown
 from trajectories.path import ReferencePath
 
 Array = NDArray[np.float64]

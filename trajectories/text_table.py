@@ -8,7 +8,8 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from trajectories.fileio import read_text, shortened, shown
+from trajectories.arguments import shortened, shown
+from trajectories.fileio import read_text
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,8 @@ import safetensors
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from trajectories.fileio import checked, parse_json, read_bytes, shown, write_atomically
+from trajectories.arguments import shown
+from trajectories.fileio import checked, parse_json, read_bytes, write_atomically
 
 MOST_WEIGHTS = 64 * 2**20
 """Largest .safetensors that is written or read, bytes."""

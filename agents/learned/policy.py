@@ -26,7 +26,7 @@ from agents.learned.files import (
 )
 from lpv_track_env.observation import SCALARS, ObservationLayout
 from lpv_track_env.task import checked_period
-from trajectories.fileio import shown
+from trajectories.arguments import shown
 from trajectories.naming import choose
 
 Weights = NDArray[np.float32]

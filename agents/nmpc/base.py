@@ -12,15 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.base import DrivingTask, TrackingAgent, blind_control
 from agents.classical.geometric import Stanley
-from agents.nmpc.problem import NmpcProblem
+from agents.nmpc.problem import HORIZON, NmpcProblem
 from agents.nmpc.schedule import Switching
 from agents.reference import local_reference
 from agents.weights import TrackingWeights, WeightSchedule, weights_from
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.vehicle import VehicleParameters
+from trajectories.arguments import Whole, check_fields, instance_of, shown
 
 Array = NDArray[np.float64]
 Memory = TypeVar("Memory")
+
+FAILURES = Whole(1, 1_000_000_000)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +63,13 @@ class NmpcSettings:
     max_failures: int = 10
 
     def __post_init__(self) -> None:
-        if self.selection not in {"band", "path"}:
-            raise ValueError(f"selection must be 'band' or 'path', not {self.selection!r}")
+        if self.selection not in ("band", "path"):
+            raise ValueError(f"selection must be 'band' or 'path', not {shown(self.selection)}")
+        if self.horizon is not None:
+            check_fields(self, {"horizon": HORIZON})
+        if self.model is not None:
+            instance_of("model", self.model, VehicleParameters, "VehicleParameters or None")
+        check_fields(self, {"max_failures": FAILURES})
         weights = TrackingWeights() if self.weights is None else weights_from(self.weights)
         object.__setattr__(self, "weights", weights)
 

@@ -26,13 +26,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.bicycle import fastest_pole
+from lpv_track_env.observation import MOST_STEPS
 from lpv_track_env.vehicle import VehicleParameters
+from trajectories.arguments import Number, Whole, check_fields, numbers
 
 Array = NDArray[np.float64]
 
 STATES, INPUTS, OUTPUTS, SOFT = 6, 2, 4, 3
 RK4_STABILITY = 2.78
 """Largest product of step and pole for which classic Runge-Kutta is stable (real poles)."""
+HORIZON = Whole(1, MOST_STEPS)
+"""Rule of the number of predicted periods."""
+PERIOD, PENALTY = Number(0.0, 10.0, "s", above=True), Number(0.0, 1e12)
 
 
 LARGEST = 1e9
@@ -82,12 +87,12 @@ class NmpcProblem:
     quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0)
 
     def __post_init__(self) -> None:
-        if self.horizon < 1:
-            raise ValueError(f"horizon must be at least 1, not {self.horizon}")
-        if not (math.isfinite(self.period) and self.period > 0):
-            raise ValueError(f"period must be positive, not {self.period} s")
-        if min(*self.linear_penalty, *self.quadratic_penalty) < 0:
-            raise ValueError("penalties must not be negative")
+        rules: dict[str, Number | Whole] = {"horizon": HORIZON, "period": PERIOD}
+        if self.first_period is not None:
+            rules["first_period"] = PERIOD
+        check_fields(self, rules)
+        for name in ("linear_penalty", "quadratic_penalty"):
+            object.__setattr__(self, name, numbers(name, getattr(self, name), PENALTY, 3))
 
     def parameters(
         self, state: Array, last_input: Array, reference: Array, weights: Array

@@ -40,7 +40,7 @@ from agents.weights import FORMAT as SCHEDULE
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.task import checked_period
-from trajectories.fileio import shown
+from trajectories.arguments import shown
 
 WEIGHT_POLICY = Kind(
     format="lpv-track-weights/1",

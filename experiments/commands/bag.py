@@ -2,18 +2,20 @@
 
 import argparse
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from experiments.commands.options import (
     add_agent_settings,
+    add_control_period,
     add_out,
     add_seed,
     add_settings,
     add_vehicle,
     agent_settings,
+    file_name,
+    number,
     parse_settings,
 )
 from experiments.ros.topics import KINDS, SECOND, Datum, GeoPoint, Topic
@@ -55,7 +57,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         if name != "export":
-            action.add_argument("file", type=Path, metavar="FILE")
+            action.add_argument("file", type=file_name, metavar="FILE")
         if name in declare:
             declare[name](action)
 
@@ -75,7 +77,7 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
     add_agent_settings(parser)
     add_settings(parser, "--env")
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="BAG",
+        "--out", type=file_name, required=True, metavar="BAG",
         help="NAME.bag for ROS 1, else the folder of a ROS 2 bag",
     )  # fmt: skip
     parser.add_argument(
@@ -88,13 +90,13 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_reference(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, required=True, metavar="CSV")
+    parser.add_argument("--out", type=file_name, required=True, metavar="CSV")
     parser.add_argument(
         "--source", choices=["odometry", "fix"], help="default: odometry, if there is any"
     )
     _add_topics(parser, ("odometry", "fix"))
     parser.add_argument(
-        "--smoothing", type=float, metavar="M",
+        "--smoothing", type=number(0.0, 1e6, "m", above=True), metavar="M",
         help="rms distance of recorded positions from the line, m (default: cross-validated)",
     )  # fmt: skip
     parser.add_argument(
@@ -111,7 +113,7 @@ def _add_replay(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--agent", default="lpv-nmpc", metavar="NAME")
     add_vehicle(parser)
     add_agent_settings(parser)
-    parser.add_argument("--control-period", type=float, default=0.05, metavar="S")
+    add_control_period(parser, 0.05)
     add_out(parser, "results/replay")
     _add_topics(parser, SELECTED)
     _add_datum(parser, "the path's x = y = 0 (default: the path's, the bag's, or the first fix)")
@@ -126,7 +128,7 @@ def _add_topics(parser: argparse.ArgumentParser, kinds: tuple[str, ...]) -> None
 
 def _add_datum(parser: argparse.ArgumentParser, meaning: str) -> None:
     parser.add_argument(
-        "--datum", type=float, nargs=3, metavar=("LAT", "LON", "H"),
+        "--datum", type=number(), nargs=3, metavar=("LAT", "LON", "H"),
         help=f"deg, deg, m: {meaning}",
     )  # fmt: skip
 

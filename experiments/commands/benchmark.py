@@ -32,7 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "fields to change, e.g. gnss_noise=0.3 computing_delay=[0.01,0.05]",
     )
     shared.add_seeds(parser, 1, "seeds 0..N-1 (default 1)")
-    parser.add_argument("--control-period", type=float, metavar="S", help="s (default 0.05)")
+    shared.add_control_period(parser)
     shared.add_settings(
         parser, "--env", "environment settings, e.g. initial_error_range=[0.3,0.1,0.5]"
     )

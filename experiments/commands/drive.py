@@ -1,7 +1,6 @@
 """`lpv-track drive`: watch a run live, write frames or a video, agents side by side."""
 
 import argparse
-from pathlib import Path
 
 from rich.console import Console
 
@@ -21,19 +20,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shared.add_agent_settings(parser)
     shared.add_settings(parser, "--env")
     parser.add_argument(
-        "--frames", type=Path, metavar="DIR", help="write PNG frames, open no window"
+        "--frames", type=shared.file_name, metavar="DIR", help="write PNG frames, open no window"
     )
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="a frame every N steps")
     parser.add_argument(
-        "--video", type=Path, metavar="FILE",
+        "--every", type=shared.whole(1, 10**9), default=1, metavar="N", help="a frame every N steps"
+    )
+    parser.add_argument(
+        "--video", type=shared.file_name, metavar="FILE",
         help="write a video, .mp4 or .gif; needs pip install 'lpv-track-env[video]'",
     )  # fmt: skip
     parser.add_argument(
-        "--fps", type=float, metavar="N",
+        "--fps", type=shared.number(0.0, 240.0, above=True), metavar="N",
         help="frames a second of the video (default: one a control period, at most 50)",
     )  # fmt: skip
     parser.add_argument(
-        "--speed-up", type=float, default=1.0, metavar="X",
+        "--speed-up", type=shared.number(0.01, 1000.0), default=1.0, metavar="X",
         help="how many times faster than real time the video runs (default 1)",
     )  # fmt: skip
     parser.add_argument(

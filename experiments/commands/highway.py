@@ -3,7 +3,6 @@
 import argparse
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -29,23 +28,30 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     shared.add_seeds(parser, 20)
     parser.add_argument(
-        "--other-vehicles", type=int, metavar="N",
+        "--other-vehicles", type=shared.whole(0, 1000), metavar="N",
         help="in the scene's terms: racetracks draw 1 to N (default: highway-env's own, 1)",
     )  # fmt: skip
-    parser.add_argument("--laps", type=int, default=1, metavar="N", help="default 1")
+    parser.add_argument(
+        "--laps", type=shared.whole(1, 1000), default=1, metavar="N", help="default 1"
+    )
     parser.add_argument("--conditions", default="simulation", metavar="NAME")
-    parser.add_argument("--control-period", type=float, default=0.05, metavar="S")
+    shared.add_control_period(parser, 0.05)
     shared.add_settings(parser, "--env", "settings of the environment", nargs="*")
     shared.add_agent_settings(parser, nargs="*")
     parser.add_argument(
-        "--video", type=Path, metavar="FILE",
+        "--video", type=shared.file_name, metavar="FILE",
         help="in place of the table a video, .mp4 or .gif, of the last seed; this project's "
         "agents side by side",
     )  # fmt: skip
     parser.add_argument(
-        "--frames", type=Path, metavar="DIR", help="likewise PNG files, one every --every steps"
+        "--frames",
+        type=shared.file_name,
+        metavar="DIR",
+        help="likewise PNG files, one every --every steps",
     )
-    parser.add_argument("--every", type=int, default=20, metavar="N", help="default 20")
+    parser.add_argument(
+        "--every", type=shared.whole(1, 10**9), default=20, metavar="N", help="default 20"
+    )
     shared.add_out(parser, "results/highway")
     shared.add_workers(parser)
 

@@ -2,10 +2,16 @@
 
 import argparse
 import importlib.metadata
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+
+from experiments.commands.options import (
+    PREVIEW_PERIOD,
+    PREVIEW_STEPS,
+    add_control_period,
+    file_name,
+)
 
 if TYPE_CHECKING:
     from agents.learned.policy import Policy
@@ -17,20 +23,22 @@ EXAMPLE = "lpv-track import-policy model.zip --algorithm ppo --trust --out mine.
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("model", type=Path, metavar="MODEL.zip", help="what model.save() wrote")
+    parser.add_argument(
+        "model", type=file_name, metavar="MODEL.zip", help="what model.save() wrote"
+    )
     parser.add_argument("--algorithm", required=True, choices=["ppo", "sac", "td3"])
     parser.add_argument(
         "--trust", action="store_true",
         help="load it, although loading such a file runs whatever code it holds",
     )  # fmt: skip
-    parser.add_argument("--out", type=Path, required=True, metavar="NAME.json")
+    parser.add_argument("--out", type=file_name, required=True, metavar="NAME.json")
     parser.add_argument(
         "--vehicle", default="m2-minibus", metavar="NAME", help="driven in training"
     )
-    parser.add_argument("--control-period", type=float, default=0.05, metavar="S")
-    parser.add_argument("--preview-steps", type=int, default=20, metavar="K")
+    add_control_period(parser, 0.05)
+    parser.add_argument("--preview-steps", type=PREVIEW_STEPS, default=20, metavar="K")
     parser.add_argument(
-        "--preview-period", type=float, metavar="S", help="default: the control period"
+        "--preview-period", type=PREVIEW_PERIOD, metavar="S", help="default: the control period"
     )
 
 

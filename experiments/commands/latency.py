@@ -26,6 +26,7 @@ from experiments.commands.options import (
     add_seeds,
     add_trajectories,
     add_workers,
+    file_name,
     resumable,
     seeds_of,
 )
@@ -57,7 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_trajectories(parser, ["T2", "T4"])
     add_seeds(parser, 10)
     parser.add_argument(
-        "--times", type=Path, metavar="FILE",
+        "--times", type=file_name, metavar="FILE",
         help="times.json of an earlier run, in place of recording",
     )  # fmt: skip
     add_out(parser, "results/latency")

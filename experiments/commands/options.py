@@ -3,64 +3,134 @@
 import argparse
 import json
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from rich.console import Console
 
+EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
+
+MOST_SEEDS, MOST_WORKERS, MOST_PATHS, MOST_STEPS = 10_000, 1024, 1000, 10**12
+
+
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """Return the type of an option that is a whole number from `low` to `high`."""
+
+    def read(text: str) -> int:
+        from trajectories.arguments import Whole
+
+        value: int = _of(Whole(low, high), _converted(int, text))
+        return value
+
+    return read
+
+
+def amount(text: str) -> int:
+    """Read a number of steps or solves, at least 1, which may be given as 2e6."""
+    from trajectories.arguments import Whole
+
+    number = _converted(float, text)
+    if isinstance(number, float) and number.is_integer():
+        number = int(number)
+    value: int = _of(Whole(1, MOST_STEPS), number)
+    return value
+
+
+def number(
+    low: float | None = None, high: float | None = None, unit: str = "", *, above: bool = False
+) -> Callable[[str], float]:
+    """Return the type of an option that is a finite number, see `trajectories.arguments.Number`."""
+
+    def read(text: str) -> float:
+        from trajectories.arguments import LARGEST, Number
+
+        bounds = -LARGEST if low is None else low, LARGEST if high is None else high
+        value: float = _of(Number(*bounds, unit, above), _converted(float, text))
+        return value
+
+    return read
+
+
+def file_name(text: str) -> Path:
+    """Read the name of a file or folder, which must not be empty."""
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError("is not the name of a file or folder")
+    return Path(text)
+
+
+def _converted(convert: Callable[[str], float], text: str) -> Any:
+    try:
+        return convert(text)
+    except ValueError:
+        return text
+
+
+def _of(rule: Any, value: Any) -> Any:
+    """Apply a rule; its error becomes the one with which the option is named."""
+    try:
+        return rule.of("", value)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error).strip()) from None
+
+
+PREVIEW_STEPS = whole(1, 1000)
+PREVIEW_PERIOD = number(0.0, 10.0, "s", above=True)
 
 
 def add_out(parser: argparse.ArgumentParser, default: str) -> None:
     """Add `--out DIR`."""
-    parser.add_argument("--out", type=Path, default=Path(default), metavar="DIR")
+    parser.add_argument("--out", type=file_name, default=Path(default), metavar="DIR")
 
 
 def add_job(parser: argparse.ArgumentParser, folder: str) -> None:
     """Add the options that trainings and tunings share; `folder` is the default of `--out`."""
-    parser.add_argument("--out", type=Path, metavar="DIR", help=f"default: {folder}")
+    parser.add_argument("--out", type=file_name, metavar="DIR", help=f"default: {folder}")
     parser.add_argument("--resume", action="store_true", help="go on from the last state in DIR")
-    parser.add_argument("--seed", type=int, default=0, help="0 to 999 (default 0)")
+    parser.add_argument("--seed", type=whole(0, 999), default=0, help="0 to 999 (default 0)")
     parser.add_argument("--vehicle", metavar="NAME", help="preset or .json (default m2-minibus)")
-    parser.add_argument("--control-period", type=float, metavar="S", help="s (default 0.05)")
-    parser.add_argument("--preview-steps", type=int, metavar="K", help="default 20")
+    add_control_period(parser)
+    parser.add_argument("--preview-steps", type=PREVIEW_STEPS, metavar="K", help="default 20")
     parser.add_argument(
-        "--preview-period", type=float, metavar="S", help="s (default: the control period)"
-    )
+        "--preview-period", type=PREVIEW_PERIOD, metavar="S",
+        help="s (default: the control period)",
+    )  # fmt: skip
+
+
+def add_control_period(parser: argparse.ArgumentParser, default: float | None = None) -> None:
+    """Add `--control-period S`; its default is that of the environment unless one is given."""
+    parser.add_argument(
+        "--control-period", type=number(0.001, 1.0, "s"), default=default, metavar="S",
+        help="s (default 0.05)",
+    )  # fmt: skip
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
     """Add `--workers N`, all cores by default."""
     parser.add_argument(
-        "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores"
-    )
+        "--workers", type=whole(1, MOST_WORKERS), default=os.cpu_count() or 1, metavar="N",
+        help="default: all cores",
+    )  # fmt: skip
 
 
 def add_seed(parser: argparse.ArgumentParser) -> None:
     """Add `--seed`, 0 by default."""
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=whole(0, 2**63 - 1), default=0)
 
 
 def add_seeds(parser: argparse.ArgumentParser, default: int, meaning: str = "") -> None:
     """Add `--seeds N`; `seeds_of` reads it."""
     parser.add_argument(
-        "--seeds", type=int, default=default, metavar="N", help=meaning or f"default {default}"
-    )
+        "--seeds", type=whole(1, MOST_SEEDS), default=default, metavar="N",
+        help=meaning or f"default {default}",
+    )  # fmt: skip
 
 
 def seeds_of(options: argparse.Namespace) -> range:
-    """Return the seeds 0 to N - 1 of `--seeds N`.
-
-    Raises
-    ------
-    ValueError
-        If N is below 1.
-    """
-    if options.seeds < 1:
-        raise ValueError(f"--seeds must be at least 1, not {options.seeds}")
+    """Return the seeds 0 to N - 1 of `--seeds N`."""
     return range(options.seeds)
 
 
@@ -93,23 +163,24 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        For a pair without "=", or a number that is not finite.
+        For a pair without "=", or JSON beyond the bounds of `trajectories.fileio.parse_json`.
     """
-
-    def refuse(constant: str) -> NoReturn:
-        raise OverflowError(constant)
+    from trajectories.arguments import shown
+    from trajectories.fileio import parse_json
 
     settings: dict[str, Any] = {}
     for pair in pairs:
         key, separator, value = pair.partition("=")
         if not separator or not key:
-            raise ValueError(f"{pair!r} is not KEY=VALUE")
+            raise ValueError(f"{shown(pair)} is not KEY=VALUE")
         try:
-            settings[key] = json.loads(value, parse_constant=refuse)
-        except OverflowError:
-            raise ValueError(f"{pair}: numbers must be finite") from None
+            json.loads(value)
         except ValueError:
             settings[key] = value
+        except RecursionError:
+            raise ValueError(f"{shown(pair)}: nested too deeply") from None
+        else:
+            settings[key] = parse_json(value, pair)
     return settings
 
 

@@ -1,16 +1,17 @@
 """`lpv-track report`: the tables and report.html of saved cases."""
 
 import argparse
-from pathlib import Path
 
 from rich.console import Console
+
+from experiments.commands.options import file_name
 
 EXAMPLE = "lpv-track report results/benchmark"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("folder", type=Path, metavar="DIR")
+    parser.add_argument("folder", type=file_name, metavar="DIR")
     parser.add_argument(
         "--open-named-files", action="store_true",
         help="open the files of paths and vehicles that the results name; for results you trust",

@@ -13,7 +13,14 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from experiments.commands.options import add_out, add_seed, add_vehicle, resumable
+from experiments.commands.options import (
+    add_out,
+    add_seed,
+    add_vehicle,
+    file_name,
+    resumable,
+    whole,
+)
 
 if TYPE_CHECKING:
     from agents.weights import TrackingWeights
@@ -25,28 +32,30 @@ MOST_SPAN = 1e4
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument(
-        "--episodes", type=int, default=2000, metavar="N", help="of each arm (default 2000)"
-    )
+        "--episodes", type=whole(1, 10_000_000), default=2000, metavar="N",
+        help="of each arm (default 2000)",
+    )  # fmt: skip
     parser.add_argument(
         "--spans", nargs="+", default=["10", "100", "1000", "whole"], metavar="FACTOR",
         help="how far weights are drawn from the base ones (default 10 100 1000 whole: the "
         "whole bounds of weights)",
     )  # fmt: skip
     parser.add_argument(
-        "--weights", type=Path, metavar="FILE",
+        "--weights", type=file_name, metavar="FILE",
         help="schedule of one set to switch around, as of tune --method search (default: the "
         "default weights)",
     )  # fmt: skip
     parser.add_argument(
-        "--candidates", type=int, default=4, metavar="K",
+        "--candidates", type=whole(1, 10_000), default=4, metavar="K",
         help="draws in every window; the adversary takes the worst of them (default 4)",
     )  # fmt: skip
     parser.add_argument("--conditions", default="realtime", metavar="NAME")
     add_vehicle(parser)
     add_seed(parser)
     parser.add_argument(
-        "--threads", type=int, default=1, metavar="N", help="default 1; results do not depend on it"
-    )
+        "--threads", type=whole(1, 1024), default=1, metavar="N",
+        help="default 1; results do not depend on it",
+    )  # fmt: skip
     add_out(parser, "results/switching")
 
 

@@ -13,11 +13,16 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from experiments.commands.options import (
+    MOST_PATHS,
+    MOST_STEPS,
     add_job,
     add_settings,
     add_trajectories,
+    amount,
+    number,
     parse_settings,
     resumable,
+    whole,
 )
 from experiments.training import ALGORITHMS
 
@@ -49,10 +54,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_job(parser, "results/train/ALGORITHM")
     parser.add_argument(
-        "--steps", type=float, metavar="N", help="budget in environment steps, e.g. 2e7"
+        "--steps", type=amount, metavar="N", help="budget in environment steps, e.g. 2e7"
     )
     parser.add_argument(
-        "--hours", type=float, metavar="H",
+        "--hours", type=number(0.0, 10_000.0, "h", above=True), metavar="H",
         help="budget in hours: as many steps as a trial says will fit, or --steps cut short",
     )  # fmt: skip
     parser.add_argument(
@@ -70,13 +75,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_trajectories(
         parser, None, "own paths in place of random ones; not those of the suites paper and learned"
     )
-    parser.add_argument("--paths", type=int, metavar="N", help="random paths (default 48)")
     parser.add_argument(
-        "--envs", type=int, metavar="N",
+        "--paths", type=whole(1, MOST_PATHS), metavar="N", help="random paths (default 48)"
+    )
+    parser.add_argument(
+        "--envs", type=whole(1, 1_000_000), metavar="N",
         help="environments side by side (default: ppo 512, residual and bc 256, others 64)",
     )  # fmt: skip
     parser.add_argument(
-        "--segment", type=int, metavar="N",
+        "--segment", type=whole(1, MOST_STEPS), metavar="N",
         help="steps between checkpoints, each with a validation (default: ppo 1,000,000, residual "
         "250,000, others 100,000)",
     )  # fmt: skip
@@ -109,7 +116,6 @@ def settings_of(options: argparse.Namespace) -> "TrainingSettings":
     ValueError
         For an unknown name or an impossible value.
     """
-    from experiments.jobs.console import whole_number
     from experiments.training.settings import FAST, usual
 
     changes = parse_settings(options.conditions_set)
@@ -119,7 +125,7 @@ def settings_of(options: argparse.Namespace) -> "TrainingSettings":
     given: dict[str, Any] = {name: getattr(options, name) for name in PLAIN}
     given["conditions"] = kinds or None
     if options.steps is not None:
-        given["steps"] = whole_number(options.steps, "--steps")
+        given["steps"] = options.steps
     given = {key: value for key, value in given.items() if value is not None}
     hyperparameters = parse_settings(options.set)
     if options.fast:
@@ -146,8 +152,6 @@ def run(options: argparse.Namespace, console: Console) -> int:
     settings = settings_of(options)
     at_most = math.inf
     if options.hours is not None:
-        if not options.hours > 0.0:
-            raise ValueError(f"--hours must be positive, not {options.hours}")
         at_most = 3600.0 * options.hours
         if options.steps is None and resumed:
             # The number of steps that the first run found for its hours.

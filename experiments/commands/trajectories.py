@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
+from experiments.commands.options import file_name
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Normalize
@@ -39,8 +41,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "names", nargs="*", metavar="NAME", help="default: the six and their raw forms"
     )
-    parser.add_argument("--draw", type=Path, metavar="FILE", help="picture, .png or .svg")
-    parser.add_argument("--write", type=Path, metavar="DIR", help="write native CSV files")
+    parser.add_argument("--draw", type=file_name, metavar="FILE", help="picture, .png or .svg")
+    parser.add_argument("--write", type=file_name, metavar="DIR", help="write native CSV files")
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

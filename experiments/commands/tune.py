@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from experiments.commands.options import (
+    MOST_PATHS,
     add_conditions,
     add_job,
     add_settings,
+    amount,
+    number,
     parse_settings,
     resumable,
+    whole,
 )
 from experiments.tuning import METHODS
 
@@ -50,7 +54,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_job(parser, "results/tune/METHOD")
     parser.add_argument(
-        "--solves", type=float, default=300_000, metavar="N",
+        "--solves", type=amount, default=300_000, metavar="N",
         help="budget in solves of the NMPC, e.g. 3e6 (default 3e5); never exceeded",
     )  # fmt: skip
     parser.add_argument(
@@ -58,29 +62,35 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="own paths, names or files, in place of random ones; not those of the evaluation",
     )  # fmt: skip
     parser.add_argument(
-        "--random-paths", type=int, metavar="N", dest="paths", help="random paths (default 32)"
-    )
+        "--random-paths", type=whole(1, MOST_PATHS), metavar="N", dest="paths",
+        help="random paths (default 32)",
+    )  # fmt: skip
     add_conditions(
         parser, None, "simulation, realtime, randomised (default: randomised)",
         "fields to change in them, e.g. gnss_noise=[0.01,0.3]",
     )  # fmt: skip
     parser.add_argument(
-        "--drives", type=int, metavar="N",
+        "--drives", type=whole(1, 100_000), metavar="N",
         help="drives that score a candidate (default 16), environments of PPO (default 64), drives "
         "of paired (default 32)",
     )  # fmt: skip
     parser.add_argument(
-        "--time-limit", type=float, metavar="S", help="of a drive (default 10 s, PPO 20 s)"
-    )
+        "--time-limit", type=number(0.0, 1e6, "s", above=True), metavar="S",
+        help="of a drive (default 10 s, PPO 20 s)",
+    )  # fmt: skip
     parser.add_argument(
         "--directions", metavar="NAME",
         help="what is chosen apart: joint (speed, heading, position), stages (these in Q and in S, "
         "the default), all (each of Q and S)",
     )  # fmt: skip
     parser.add_argument(
-        "--span", type=float, metavar="F", help="largest factor on a default weight (default 100)"
-    )
-    parser.add_argument("--window", type=float, metavar="S", help="between decisions (default 0.4)")
+        "--span", type=number(1.0, 1e4, above=True), metavar="F",
+        help="largest factor on a default weight (default 100)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--window", type=number(0.0, 1e6, "s", above=True), metavar="S",
+        help="between decisions (default 0.4)",
+    )  # fmt: skip
     parser.add_argument(
         "--view", metavar="NAME",
         help="what catalogue and rl see: all (default), path (curvature, speed, band), drive "
@@ -103,17 +113,15 @@ def settings_of(options: argparse.Namespace) -> "TuningSettings":
     ValueError
         For an unknown name or an impossible value.
     """
-    from experiments.jobs.console import whole_number
     from experiments.tuning.settings import TuningSettings, usual
 
-    solves = whole_number(options.solves, "--solves")
     changes = parse_settings(options.conditions_set)
     kind = options.conditions or "randomised"
     fields = TuningSettings.__dataclass_fields__
     given = {name: getattr(options, name) for name in REPEATED if name in fields}
     return usual(
         options.method, **{
-            **given, "solves": solves, "seed": options.seed,
+            **given, "solves": options.solves, "seed": options.seed,
             "conditions": {"name": kind, **changes} if changes else kind,
             "hyperparameters": parse_settings(options.set),
         },

@@ -1,12 +1,18 @@
 """`lpv-track tuning-study`: compare the ways to weights."""
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from experiments.commands.options import add_out, resumable
+from experiments.commands.options import (
+    MOST_WORKERS,
+    add_out,
+    amount,
+    file_name,
+    resumable,
+    whole,
+)
 
 if TYPE_CHECKING:
     from experiments.study.study import Study
@@ -18,23 +24,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     add_out(parser, "results/tuning-study")
     parser.add_argument(
-        "--seeds", type=int, default=10, metavar="N", help="trainings a rung (default 10)"
-    )
+        "--seeds", type=whole(1, 1000), default=10, metavar="N",
+        help="trainings a rung (default 10)",
+    )  # fmt: skip
     parser.add_argument(
-        "--solves", type=float, default=300_000, metavar="N", help="of a training (default 3e5)"
+        "--solves", type=amount, default=300_000, metavar="N", help="of a training (default 3e5)"
     )
     parser.add_argument(
         "--rungs", nargs="+", metavar="NAME", help="default: all; an unknown one lists them"
     )
     parser.add_argument(
-        "--drives", type=int, default=8, metavar="N",
+        "--drives", type=whole(2, 10_000), default=8, metavar="N",
         help="drives on each path in the evaluation of a training (default 8)",
     )  # fmt: skip
     parser.add_argument(
-        "--tracks", type=Path, metavar="DIR",
+        "--tracks", type=file_name, metavar="DIR",
         help="folder of TUMFTM centre lines (x_m,y_m,...): one more set",
     )  # fmt: skip
-    parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default 2)")
+    parser.add_argument(
+        "--workers", type=whole(1, MOST_WORKERS), default=2, metavar="N",
+        help="processes (default 2)",
+    )  # fmt: skip
     parser.add_argument(
         "--quick", action="store_true",
         help="2 trainings of 60,000 solves, 2 drives a path, small oracles: a preview",
@@ -47,15 +57,11 @@ def study_of(options: argparse.Namespace) -> "Study":
     Raises
     ------
     ValueError
-        For an unknown rung, an impossible number, or a folder without tracks.
+        For an unknown rung or a folder without tracks.
     """
-    from experiments.jobs.console import whole_number
     from experiments.study.evaluation import track_set, usual_sets
     from experiments.study.study import RUNGS, Study, checked_labels
 
-    solves = whole_number(options.solves, "--solves")
-    if options.seeds < 1 or options.drives < 2:
-        raise ValueError("--seeds must be at least 1, --drives at least 2")
     labels = checked_labels(options.rungs or [rung.label for rung in RUNGS])
     quick = options.quick
     sets = usual_sets(2 if quick else options.drives)
@@ -63,7 +69,7 @@ def study_of(options: argparse.Namespace) -> "Study":
         sets.append(track_set(options.tracks, options.drives))
     return Study(
         options.out, labels, tuple(range(2 if quick else options.seeds)),
-        60_000 if quick else solves, tuple(sets),
+        60_000 if quick else options.solves, tuple(sets),
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from rich.console import Console
 
-from experiments.commands.options import add_out, add_seed, add_workers
+from experiments.commands.options import add_out, add_seed, add_workers, whole
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -65,7 +65,9 @@ ROWS = (
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("--states", type=int, default=1000, metavar="N", help="default 1000")
+    parser.add_argument(
+        "--states", type=whole(1, 1_000_000), default=1000, metavar="N", help="default 1000"
+    )
     parser.add_argument(
         "--quick", action="store_true", help=f"{QUICK} states, whatever --states says"
     )
@@ -84,18 +86,13 @@ def run(options: argparse.Namespace, console: Console) -> int:
     Raises
     ------
     ValueError
-        For no states or workers, a negative seed, or a solver that cannot be loaded.
+        For a solver that cannot be loaded.
     """
     from agents.registry import agent_class
     from experiments.run.provenance import provenance
     from trajectories.fileio import write_atomically
 
     states = QUICK if options.quick else options.states
-    for name, value in (("states", states), ("workers", options.workers)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, not {value}")
-    if options.seed < 0:
-        raise ValueError(f"seed must not be negative, not {options.seed}")
     agent_class(options.solver)
     specs = [_spec(index, options.seed, options.solver) for index in range(states)]
     began = time.perf_counter()

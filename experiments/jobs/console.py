@@ -2,7 +2,6 @@
 
 import argparse
 import importlib.util
-import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -85,19 +84,6 @@ def check_resume(folder: Path, kind: str, *, resume: bool) -> bool:
     if held and not resume:
         raise ValueError(f"{folder} holds a {kind} already: say --resume, or give another --out")
     return held
-
-
-def whole_number(value: float, option: str) -> int:
-    """Convert a number of steps or solves, which may be given as 2e6.
-
-    Raises
-    ------
-    ValueError
-        Unless it is a whole number of at least 1.
-    """
-    if not (math.isfinite(value) and value >= 1 and value == int(value)):
-        raise ValueError(f"{option} must be a whole number of at least 1, not {value:g}")
-    return int(value)
 
 
 def repeated(

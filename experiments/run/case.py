@@ -38,8 +38,8 @@ from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import SPEED_MODES
 from lpv_track_env.vehicle import VehicleParameters
+from trajectories.arguments import shortened
 from trajectories.compilation import source_digest
-from trajectories.fileio import shortened
 from trajectories.naming import choose
 
 VEHICLE_FIELDS = tuple(field.name for field in fields(VehicleParameters))

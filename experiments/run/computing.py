@@ -7,11 +7,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lpv_track_env.conditions import LONGEST_DELAY
+from lpv_track_env.task import checked_period
+from lpv_track_env.validation import SEED
+from trajectories.arguments import Number, array, shown
 from trajectories.naming import choose
 
 Array = NDArray[np.float64]
 
 ARRANGEMENTS = ("sequential", "triggered", "free-running")
+MAILBOX, LOAD = Number(0.0, 1e6, "s"), Number(0.0, 1e6, above=True)
 LEVELS = 65
 """Number of quantiles that represent a distribution."""
 
@@ -73,12 +77,13 @@ class ComputingTimes:
     ) -> None:
         self.arrangement = choose("arrangement", arrangement, ARRANGEMENTS)
         if isinstance(control, str) and control != "measured":
-            raise ValueError(f"control must be times in s or 'measured', not {control!r}")
+            raise ValueError(f"control must be times in s or 'measured', not {shown(control)}")
         self._control = None if isinstance(control, str) else _checked("control", control)
         self._estimation = _checked("estimation", estimation)
-        if not (mailbox >= 0.0 and load > 0.0):
-            raise ValueError("mailbox must be >= 0 s, load positive")
-        self._mailbox, self._load, self._period = mailbox, load, period
+        self._mailbox = MAILBOX.of("mailbox", mailbox)
+        self._load = LOAD.of("load", load)
+        self._period = checked_period(period)
+        seed = SEED.of("seed", seed)
         self._rng = np.random.default_rng([seed, ARRANGEMENTS.index(arrangement)])
         self.latencies: list[float] = []
         """Latency of every period so far, s."""
@@ -114,8 +119,8 @@ class ComputingTimes:
 
 
 def _checked(name: str, times: Sequence[float] | float) -> Array:
-    values = np.atleast_1d(np.asarray(times, dtype=np.float64))
-    if values.size == 0 or not (np.isfinite(values) & (values >= 0.0)).all():
+    values = np.atleast_1d(array(f"{name} times", times))
+    if values.ndim > 1 or values.size == 0 or not (np.isfinite(values) & (values >= 0.0)).all():
         raise ValueError(f"{name} times must be finite and >= 0 s")
     return np.sort(values)
 

@@ -10,12 +10,13 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.estimation.estimator import EstimatorSettings
+from trajectories.arguments import Number, check_fields, flag, instance_of, shown
 from trajectories.naming import choose
 
 Array = NDArray[np.float64]
@@ -161,15 +162,21 @@ class Conditions:
     max_command_age: float | None = None
 
     def __post_init__(self) -> None:
+        instance_of("conditions: name", self.name, str, "a text")
         choose("estimator", self.estimator, ESTIMATORS)
+        settings = self.estimator_settings
+        if settings is not None:
+            instance_of(
+                "conditions: estimator_settings", settings, EstimatorSettings, "EstimatorSettings"
+            )
         for name in DRAWN:
             object.__setattr__(self, name, _checked(name, getattr(self, name)))
-        if not 0.001 <= self.gnss_period < math.inf:
-            raise ValueError(f"conditions: gnss_period must be >= 0.001 s, not {self.gnss_period}")
-        for name in ("max_fix_age", "max_command_age"):
-            value = getattr(self, name)
-            if value is not None and not value > 0.0:
-                raise ValueError(f"conditions: {name} must be positive, not {value!r}")
+        calibrate = flag("conditions: calibrate_steering", self.calibrate_steering)
+        object.__setattr__(self, "calibrate_steering", calibrate)
+        ages = {"max_fix_age": AGE}
+        if self.max_command_age is not None:
+            ages["max_command_age"] = AGE
+        check_fields(self, {"gnss_period": GNSS_PERIOD, **ages}, prefix="conditions: ")
 
     def replace(self, **changes: object) -> "Conditions":
         """Return a copy with some fields changed, named "custom" unless a name is given."""
@@ -237,31 +244,35 @@ class Conditions:
         return dataclasses.asdict(self)
 
 
-FACTORS = frozenset(
-    {
-        "mass_factor",
-        "inertia_factor",
-        "front_stiffness_factor",
-        "rear_stiffness_factor",
-        "friction",
-        "gnss_wander_time",
-        "gust_time",
-    }
-)
-"""Fields that must be positive."""
-SIGNED = frozenset({"heading_bias", "yaw_rate_bias", "speed_scale", "steering_offset"})
-"""Fields that may be negative."""
+DRAWN = tuple(item.name for item in dataclasses.fields(Conditions) if item.type in {Range, "Range"})
+"""Fields that may be ranges, in the order in which they are drawn."""
+
+GNSS_PERIOD, AGE = Number(0.001, 1e6, "s"), Number(0.0, math.inf, "s", above=True)
+"""Rules of the time between fixes, and of the ages after which the vehicle brakes."""
 DELAYS = ("gnss_latency", "steering_dead_time", "drive_dead_time", "computing_delay")
 """Fields that are at most `LONGEST_DELAY`."""
 LONGEST_DELAY = 2.0
 """Largest delay, s: it bounds the sizes of the arrays."""
+DELAY = Number(0.0, LONGEST_DELAY, "s")
+RULES: dict[str, Number] = {
+    **dict.fromkeys(DRAWN, Number(0.0, 1e6)),
+    **dict.fromkeys(DELAYS, DELAY),
+    **dict.fromkeys(
+        ("mass_factor", "inertia_factor", "front_stiffness_factor", "rear_stiffness_factor"),
+        Number(0.01, 100.0),
+    ),
+    **dict.fromkeys(("gnss_wander_time", "gust_time"), Number(1e-3, 1e9, "s")),
+    **dict.fromkeys(
+        ("heading_bias", "yaw_rate_bias", "speed_scale", "steering_offset"), Number(-1e6, 1e6)
+    ),
+    "rolling_factor": Number(0.0, 1000.0),
+    "friction": Number(0.001, math.inf),
+}
+"""Rule of every field that may be a range."""
 USUAL_SPEED = 8.0
 """Speed at which the filter's settings convert the scale error of the wheels to noise, m/s."""
 WIND_LEVER = 0.3
 """Distance from the centre of gravity forward to the point of the side wind, m: bluff fronts."""
-
-DRAWN = tuple(item.name for item in dataclasses.fields(Conditions) if item.type in {Range, "Range"})
-"""Fields that may be ranges, in the order in which they are drawn."""
 
 
 def _checked(name: str, value: object) -> Range:
@@ -272,26 +283,18 @@ def _checked(name: str, value: object) -> Range:
     ValueError
         Naming the field.
     """
+    rule = RULES[name]
     try:
-        ends = tuple(map(float, value)) if isinstance(value, tuple | list) else (float(value),)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        ends = ()
-    top = math.inf if name == "friction" else math.nextafter(math.inf, 0.0)
-    if name in DELAYS:
-        top = LONGEST_DELAY
-    low = -top if name in SIGNED else 0.0
-    good = 0 < len(ends) < 3 and all(low <= end <= top for end in ends) and ends[0] <= ends[-1]
-    if good and name in FACTORS:
-        good = ends[0] > 0.0
-    if len(ends) == 2 and math.isinf(ends[1]):
-        good = False
-    if not good:
-        sign = "a number" if name in SIGNED else "positive" if name in FACTORS else ">= 0"
-        limit = f" and at most {LONGEST_DELAY:g} s" if name in DELAYS else ""
-        raise ValueError(
-            f"conditions: {name} must be {sign}{limit}, or (low, high) of such, not {value!r}"
-        )
-    return ends[0] if len(ends) == 1 else (ends[0], ends[1])
+        if not isinstance(value, tuple | list):
+            return rule.of(name, value)
+        low, high = (rule.of(name, end) for end in value)
+        if low <= high < math.inf:
+            return low, high
+    except ValueError:
+        pass
+    raise ValueError(
+        f"conditions: {name} must be {rule}, or (low, high) of such, not {shown(value)}"
+    )
 
 
 IDEAL = Conditions("ideal", estimator="truth")
@@ -347,7 +350,7 @@ PRESETS: dict[str, Conditions | None] = {
 """Conditions by name; None stands for the kernels without conditions."""
 
 
-def load(value: "str | Conditions | dict[str, object]") -> Conditions | None:
+def load(value: "str | Conditions | dict[str, Any]") -> Conditions | None:
     """Resolve a preset's name, a dictionary of fields, or conditions; None is `simulation`.
 
     A dictionary may name the preset that it changes as `name`: {"name": "realtime",
@@ -365,15 +368,21 @@ def load(value: "str | Conditions | dict[str, object]") -> Conditions | None:
         changes = dict(value)
         for key in changes:
             choose("field of conditions", key, known)
-        preset = PRESETS[choose("conditions", str(changes.pop("name", "ideal")), tuple(PRESETS))]
-        settings = changes.pop("estimator_settings", None)
-        for key in settings or {}:  # type: ignore[attr-defined]
+        preset = PRESETS[choose("conditions", changes.pop("name", "ideal"), tuple(PRESETS))]
+        settings: Any = changes.pop("estimator_settings", None)
+        if isinstance(settings, EstimatorSettings):
+            settings = dataclasses.asdict(settings)
+        if settings is not None:
+            instance_of(
+                "conditions: estimator_settings", settings, dict, "a dictionary of settings"
+            )
+        for key in settings or {}:
             choose("estimator setting", key, tuple(EstimatorSettings.__dataclass_fields__))
         if not (changes or settings):
             return preset
         changed = (preset or IDEAL).replace(**changes)
         if settings:
-            filtered = dataclasses.replace(changed.filter_settings, **settings)  # type: ignore[arg-type]
+            filtered = dataclasses.replace(changed.filter_settings, **settings)
             changed = changed.replace(estimator_settings=filtered)
         return changed
     return PRESETS[choose("conditions", value, tuple(PRESETS))]

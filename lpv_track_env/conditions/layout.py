@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels
-from lpv_track_env.conditions import DRAWN, ESTIMATORS, LONGEST_DELAY, Conditions
+from lpv_track_env.conditions import DELAY, DRAWN, ESTIMATORS, Conditions
 from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.vehicle import PARAMETER_ORDER, VehicleParameters
 from trajectories.compilation import compiled_internal
@@ -161,11 +161,10 @@ class ConditionedVehicle(NamedTuple):
         Raises
         ------
         ValueError
-            If one is negative or longer than `LONGEST_DELAY`.
+            If one is negative or longer than `conditions.LONGEST_DELAY`.
         """
-        if not (0.0 <= latency <= LONGEST_DELAY and 0.0 <= occupied <= LONGEST_DELAY):
-            raise ValueError(f"computing times must be 0 to {LONGEST_DELAY:g} s")
-        self.vehicle[LATENCY], self.vehicle[OCCUPIED] = latency, occupied
+        times = [DELAY.of("computing times", time) for time in (latency, occupied)]
+        self.vehicle[LATENCY], self.vehicle[OCCUPIED] = times
 
 
 def info_of(m: Array) -> dict[str, Any]:

@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 from lpv_track_env.bicycle import PSI, longest_substep
 from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.vehicle import VehicleParameters
+from trajectories.arguments import Number, check_fields
 
 Array = NDArray[np.float64]
+
+NOT_NEGATIVE, POSITIVE = Number(0.0, 1e9), Number(1e-9, 1e9)
+"""Rules of the settings; those of sensors are positive. Their squares are finite and above 0."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class EstimatorSettings:
     Raises
     ------
     ValueError
-        If a value is not finite or is negative, or a deviation of a sensor is 0.
+        If a value is negative or above 1e9, or a deviation of a sensor is below 1e-9.
     """
 
     position_deviation: float = 0.045
@@ -78,13 +82,11 @@ class EstimatorSettings:
     most_rejected: float = 20
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"estimator: {field.name} must be finite and >= 0, not {value!r}")
-            sensor = field.name.endswith("_deviation") or field.name.endswith("_gate")
-            if sensor and not value > 0.0:
-                raise ValueError(f"estimator: {field.name} must be positive")
+        rules = {
+            field.name: POSITIVE if field.name.endswith(("_deviation", "_gate")) else NOT_NEGATIVE
+            for field in fields(self)
+        }
+        check_fields(self, rules, prefix="estimator: ")
 
     def as_array(self, vehicle: VehicleParameters) -> Array:
         """Return the settings of the kernels, shape (`filter.SETTINGS`,)."""

@@ -14,13 +14,14 @@ have to brake.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trajectories import ReferencePath
+from trajectories.arguments import Number, check_fields
 from trajectories.table import SPEED, TIME
 
 Array = NDArray[np.float64]
@@ -38,6 +39,18 @@ class Leader(NamedTuple):
 
     gap: float
     speed: float
+
+
+RULES = {
+    "time_gap": Number(0.0, 100.0, "s", above=True),
+    "standstill_gap": Number(0.0, 1000.0, "m", above=True),
+    "acceleration": Number(0.0, 1e6, "m/s^2", above=True),
+    "deceleration": Number(0.0, 1e6, "m/s^2", above=True),
+    "max_deceleration": Number(0.0, 1e6, "m/s^2", above=True),
+    "range": Number(0.0, 1e4, "m", above=True),
+    "side_clearance": Number(0.0, 100.0, "m", above=True),
+    "cut_in_time": Number(0.0, 100.0, "s", above=True),
+}
 
 
 @dataclass(frozen=True)
@@ -65,7 +78,7 @@ class CruiseControl:
     Raises
     ------
     ValueError
-        If a setting is not a positive finite number.
+        If a setting is not a positive number, or one that no traffic needs.
     """
 
     time_gap: float = 1.5
@@ -78,10 +91,7 @@ class CruiseControl:
     cut_in_time: float = 1.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"cruise control: {field.name} must be positive, not {value!r}")
+        check_fields(self, RULES, prefix="cruise control: ")
 
     def response(self, speed: float, leader: Leader) -> float:
         """Compute dv/dt, m/s^2, behind a leader; at most `acceleration`."""

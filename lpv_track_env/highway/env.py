@@ -17,9 +17,15 @@ from lpv_track_env.highway import scenes
 from lpv_track_env.highway.cruise import CruiseControl
 from lpv_track_env.highway.traffic import EgoVehicle, TrafficReference, others_on
 from lpv_track_env.task import Task
-from lpv_track_env.validation import check_action, forwards_arguments
+from lpv_track_env.validation import (
+    check_action,
+    checked_options,
+    checked_seed,
+    forwards_arguments,
+)
 from lpv_track_env.vehicle import VehicleParameters
 from lpv_track_env.vehicle import load as load_vehicle
+from trajectories.arguments import Whole, flag, instance_of
 from trajectories.naming import choose
 from trajectories.speed import SpeedLimits
 
@@ -31,6 +37,7 @@ SURROUNDINGS: dict[str, dict[str, Any]] = {
 
 OPTIONS = tuple(option for option in RESET_OPTIONS if option != "trajectory")
 """Reset options; highway-env draws the trajectory."""
+LAPS = Whole(1, 1000)
 EXTRA_TIME = 30.0
 """Default time limit beyond twice the path's duration, s."""
 
@@ -126,11 +133,18 @@ class HighwayTrackEnv(PathTrackingEnv):
         laps: int = 1,
     ) -> None:
         self.scene = scenes.load(scene, route)
-        if laps < 1 or (laps > 1 and not self.scene.closed):
-            raise ValueError(f"laps must be at least 1, and exactly 1 on an open route, not {laps}")
-        self.laps, self.cruise, self.flat = laps, cruise, flat
-        self.speed_limits = speed_limits or SpeedLimits(
-            max_speed=self.scene.max_speed, max_lateral_acceleration=2.0, max_acceleration=1.5
+        self.laps, self.flat = LAPS.of("laps", laps), flag("flat", flat)
+        if self.laps > 1 and not self.scene.closed:
+            raise ValueError(f"laps must be exactly 1 on an open route, not {laps}")
+        if cruise is not None:
+            instance_of("cruise", cruise, CruiseControl, "CruiseControl or None")
+        self.cruise = cruise
+        if speed_limits is None:
+            speed_limits = SpeedLimits(
+                max_speed=self.scene.max_speed, max_lateral_acceleration=2.0, max_acceleration=1.5
+            )
+        self.speed_limits = instance_of(
+            "speed_limits", speed_limits, SpeedLimits, "SpeedLimits or None"
         )
         config = _observation_config(surroundings)
         self.highway = self.scene.make(other_vehicles, config or SURROUNDINGS["lidar"])
@@ -170,9 +184,7 @@ class HighwayTrackEnv(PathTrackingEnv):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see the class for `options`."""
-        options = dict(options or {})
-        for key in options:
-            choose("reset option", key, OPTIONS)
+        options, seed = checked_options(options, OPTIONS), checked_seed(seed)
         drawn = int(self.np_random.integers(2**31)) if seed is None else seed
         # An error below leaves no running episode, because its road is gone.
         self._running = False
@@ -265,4 +277,5 @@ def _observation_config(surroundings: str | Mapping[str, Any] | None) -> dict[st
         return None
     if isinstance(surroundings, str):
         return SURROUNDINGS[choose("surroundings", surroundings, tuple(SURROUNDINGS))]
-    return dict(surroundings)
+    words = "a name, a configuration of highway-env or None"
+    return dict(instance_of("surroundings", surroundings, Mapping, words))

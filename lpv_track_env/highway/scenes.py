@@ -16,7 +16,7 @@ they collide there.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from lpv_track_env.highway import routes
 from lpv_track_env.rendering import Scenery
 from trajectories import ReferencePath
+from trajectories.arguments import Whole, instance_of, shown
 from trajectories.naming import choose
 from trajectories.speed import SpeedLimits
 
@@ -48,6 +49,9 @@ SURFACE_LENGTH = 10.0
 """Length of a lane that is drawn as one surface, m."""
 EDGE_SPACING = 1.0
 """Distance between the drawn points of a lane's edges, m."""
+
+OTHER_VEHICLES = Whole(0, 1000)
+"""Rule of a number of vehicles; each of them looks for all others in every step."""
 
 Array = NDArray[np.float64]
 
@@ -106,9 +110,7 @@ class Scene:
         if other_vehicles is not None:
             if self.traffic is None:
                 raise ValueError(f"scene {self.name!r} has its own number of other vehicles")
-            if other_vehicles < 0:
-                raise ValueError(f"other_vehicles must be 0 or more, not {other_vehicles}")
-            config[self.traffic] = other_vehicles
+            config[self.traffic] = OTHER_VEHICLES.of("other_vehicles", other_vehicles)
         if isinstance(self.road, str):
             made: AbstractEnv = gymnasium.make(
                 self.road, config=config, disable_env_checker=True
@@ -141,12 +143,21 @@ def load(scene: "str | Scene | RoadNetwork", route: Sequence[str] | None = None)
     if isinstance(scene, RoadNetwork):
         if route is None:
             raise ValueError("a road network needs a route: the names of its nodes, in order")
-        return Scene("network", scene, tuple(route))
-    if isinstance(scene, str):
+        return Scene("network", scene, _nodes(route))
+    if not isinstance(scene, Scene):
         scene = SCENES[choose("scene", scene, tuple(SCENES))]
     if route is None:
         return scene
-    return replace(scene, route=tuple(route))
+    return replace(scene, route=_nodes(route))
+
+
+def _nodes(route: Sequence[str]) -> tuple[str, ...]:
+    """Return the nodes of a route, two or more of them."""
+    words = "two or more names of nodes, in order"
+    nodes = tuple(instance_of("route", route, list | tuple, words))
+    if len(nodes) < 2 or not all(isinstance(node, Hashable) for node in nodes):
+        raise ValueError(f"route must be {words}, not {shown(route)}")
+    return nodes
 
 
 def populate(highway: AbstractEnv, seed: int) -> Vehicle:

@@ -103,7 +103,7 @@ def make(plant: str | Factory, vehicle: VehicleParameters) -> Plant | None:
     ModuleNotFoundError
         If the plant needs a package that is not installed; the message says how to install it.
     """
-    if not isinstance(plant, str):
+    if callable(plant):
         return plant(vehicle)
     if choose("plant", plant, names()) == BICYCLE:
         return None

@@ -678,15 +678,15 @@ BAD_RESETS: dict[str, tuple[dict[str, Any], str]] = {
         {"lateral_eror": 1.0},
         r"unknown reset option 'lateral_eror'; known: trajectory.* \(nearest: lateral_error\)",
     ),
-    "negative": ({"arc_length": -1.0}, r"arc_length must be in \[0, 200.00\] m"),
-    "beyond": ({"arc_length": 201.0}, r"arc_length must be in \[0, 200.00\] m"),
-    "nan": ({"heading_error": math.nan}, "heading_error must be a finite number, not nan"),
-    "inf": ({"speed_error": math.inf}, "speed_error must be a finite number, not inf"),
-    "text": ({"lateral_error": "left"}, "lateral_error must be a finite number, not 'left'"),
-    "none": ({"lateral_error": None}, "lateral_error must be a finite number, not None"),
+    "negative": ({"arc_length": -1.0}, "arc_length must be >= 0 and at most 200 m"),
+    "beyond": ({"arc_length": 201.0}, "arc_length must be >= 0 and at most 200 m"),
+    "nan": ({"heading_error": math.nan}, "heading_error must be in .*, not nan"),
+    "inf": ({"speed_error": math.inf}, "speed_error must be in .*, not inf"),
+    "text": ({"lateral_error": "left"}, "lateral_error must be in .*, not 'left'"),
+    "none": ({"lateral_error": None}, "lateral_error must be in .*, not None"),
     "trajectory": ({"trajectory": "T7"}, "unknown trajectory 'T7'"),
     "vehicle": ({"vehicle": "tank"}, "unknown vehicle 'tank'"),
-    "late": ({"trajectory": "T2", "lateral_error": math.nan}, "lateral_error must be a finite"),
+    "late": ({"trajectory": "T2", "lateral_error": math.nan}, "lateral_error must be in"),
 }
 
 
@@ -746,15 +746,15 @@ BAD_ARGUMENTS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "period": ({"control_period": 0.0}, r"control_period must be in \[0.001, 1\] s, not 0.0"),
     "period-nan": ({"control_period": math.nan}, "control_period must be in"),
-    "preview": ({"preview_steps": 0}, "preview_steps must be at least 1, not 0"),
-    "preview_period": ({"preview_period": -1.0}, "preview_period must be in"),
+    "preview": ({"preview_steps": 0}, "preview_steps must be a whole number from 1 to 1,000"),
+    "preview_period": ({"preview_period": -1.0}, "preview_period must be positive and at"),
     "corridor": ({"max_lateral_error": 0.0}, "max_lateral_error must be positive"),
     "time_limit": ({"time_limit": -1.0}, "time_limit must be positive"),
-    "time_limit-inf": ({"time_limit": math.inf}, "time_limit must be positive and finite"),
-    "errors": ({"initial_error_range": (1.0, 2.0)}, "initial_error_range must be three numbers"),
-    "errors-negative": ({"initial_error_range": (1.0, -2.0, 0.0)}, "initial_error_range must be"),
-    "errors-nan": ({"initial_error_range": (math.nan, 0.0, 0.0)}, "initial_error_range must be"),
-    "errors-inf": ({"initial_error_range": (math.inf, 0.0, 0.0)}, "initial_error_range must be"),
+    "time_limit-inf": ({"time_limit": math.inf}, "time_limit must be positive"),
+    "errors": ({"initial_error_range": (1.0, 2.0)}, "initial_error_range must be 3 numbers"),
+    "errors-negative": ({"initial_error_range": (1.0, -2.0, 0.0)}, "initial_error_range.+ must be"),
+    "errors-nan": ({"initial_error_range": (math.nan, 0.0, 0.0)}, "initial_error_range.+ must be"),
+    "errors-inf": ({"initial_error_range": (math.inf, 0.0, 0.0)}, "initial_error_range.+ must be"),
 }  # fmt: skip
 
 
@@ -767,7 +767,7 @@ def test_bad_argument_is_named(arguments: dict[str, Any], message: str) -> None:
 @pytest.mark.parametrize("name", list(RewardWeights.__dataclass_fields__))
 def test_bad_reward_weight_is_named(name: str) -> None:
     for value in (-1.0, math.nan, math.inf):
-        with pytest.raises(ValueError, match=f"reward weight {name} must not be"):
+        with pytest.raises(ValueError, match=f"reward weight {name} must be"):
             RewardWeights(**{name: value})
     if name.endswith("_scale"):
         with pytest.raises(ValueError, match=name):

@@ -173,7 +173,7 @@ def test_an_empty_mask_is_all() -> None:
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"arc_length": -1.0}, ValueError, r"arc_length must be in \[0"),
+        ({"arc_length": -1.0}, ValueError, "arc_length must be >= 0"),
         ({"arc_lenght": 1.0}, ValueError, "unknown reset option 'arc_lenght'"),
         ({"reset_mask": [True, False]}, TypeError, "must be a NumPy array of dtype bool"),
         ({"reset_mask": np.zeros(2, bool)}, ValueError, "must mark at least one"),

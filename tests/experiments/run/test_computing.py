@@ -70,7 +70,7 @@ def test_the_same_seed_draws_the_same() -> None:
         ({"control": [0.1, np.nan]}, "control times must be finite"),
         ({"estimation": [-0.1]}, "estimation times must be"),
         ({"estimation": []}, "estimation times must be"),
-        ({"load": 0.0}, "load positive"),
+        ({"load": 0.0}, "load must be positive"),
     ],
 )
 def test_errors(changes: dict[str, Any], message: str) -> None:

@@ -329,9 +329,9 @@ def test_errors(case: str) -> None:
 
 
 def test_bad_settings() -> None:
-    with pytest.raises(ValueError, match="speed_noise must be finite and >= 0"):
+    with pytest.raises(ValueError, match="speed_noise must be >= 0"):
         EstimatorSettings(speed_noise=-1.0)
-    with pytest.raises(ValueError, match="position_deviation must be positive"):
+    with pytest.raises(ValueError, match="position_deviation must be in"):
         EstimatorSettings(position_deviation=0.0)
     with pytest.raises(ValueError, match="period and memory"):
         Estimator(CAR, period=0.5, memory=0.3)

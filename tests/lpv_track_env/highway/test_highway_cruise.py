@@ -115,7 +115,7 @@ def test_a_stop_stays_one() -> None:
 
 @pytest.mark.parametrize("name", ["time_gap", "standstill_gap", "acceleration", "range"])
 def test_settings_must_be_positive(name: str) -> None:
-    with pytest.raises(ValueError, match=f"{name} must be positive, not -1.0"):
+    with pytest.raises(ValueError, match=f"{name} must be positive and at most .*, not -1.0"):
         CruiseControl(**{name: -1.0})
 
 

@@ -279,10 +279,10 @@ def test_conditions_and_plants_are_path_trackings() -> None:
         ({"scene": "racetrak"}, "nearest: racetrack"),
         ({"surroundings": "radar"}, "unknown surroundings 'radar'"),
         ({"scene": "roundabout", "other_vehicles": 3}, "own number of other vehicles"),
-        ({"other_vehicles": -1}, "other_vehicles must be 0 or more"),
+        ({"other_vehicles": -1}, "other_vehicles must be a whole number"),
         (
             {"scene": "roundabout", "laps": 2},
-            "laps must be at least 1, and exactly 1 on an open route",
+            "laps must be exactly 1 on an open route",
         ),
         ({"scene": straight_network()}, "needs a route"),
         ({"scene": straight_network(), "route": ("a", "c")}, "no road from 'a' to 'c'"),
@@ -304,7 +304,7 @@ def test_a_path_is_no_option_of_reset() -> None:
 def test_a_reset_that_is_refused_leaves_no_half_episode() -> None:
     env = make(other_vehicles=5)
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="lateral_error must be a finite number"):
+    with pytest.raises(ValueError, match="lateral_error must be in"):
         env.reset(seed=1, options={"lateral_error": np.nan})
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(2, dtype=np.float32))
