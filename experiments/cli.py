@@ -56,7 +56,9 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise a ValueError, which is one line, in place of the usage and an exit."""
-        raise ValueError(f"{_short(message)}; {self.prog} --help lists the options")
+        # As all other messages name an option and what it must be.
+        words = message.removeprefix("argument ").replace(": must be ", " must be ", 1)
+        raise ValueError(f"{_short(words)}; {self.prog} --help lists the options")
 
 
 def _short(message: str) -> str:

@@ -319,9 +319,9 @@ def test_unknown_names_list_the_known_and_the_nearest(
     ("arguments", "reason"),
     [
         ([*ONE, "--env", "time_limit"], "'time_limit' is not KEY=VALUE"),
-        ([*ONE, "--env", "time_limit=Infinity"], "numbers must be finite"),
-        ([*ONE, "--seeds", "0"], "--seeds must be at least 1"),
-        ([*ONE, "--workers", "0"], "workers must be at least 1, not 0"),
+        ([*ONE, "--env", "time_limit=Infinity"], "Infinity is no number"),
+        ([*ONE, "--seeds", "0"], "--seeds must be a whole number from 1 to 10,000, not 0"),
+        ([*ONE, "--workers", "0"], "--workers must be a whole number from 1 to 1,024, not 0"),
         (["--agents", "stanley", "--trajectories", "none.csv"], "none.csv"),
         (["--agents", "stanley", "--vehicles", "none.json"], "none.json"),
         (["--agents", "no.such:Agent"], "cannot be loaded"),

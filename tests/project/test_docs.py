@@ -144,8 +144,8 @@ def test_command_lines_are_those_of_the_parser(
             continue
         try:
             parser().parse_args(words)
-        except SystemExit:
-            pytest.fail(f"{page.name}: {line}\n{capsys.readouterr().err}")
+        except (SystemExit, ValueError) as error:
+            pytest.fail(f"{page.name}: {line}\n{error}{capsys.readouterr().err}")
 
 
 def _subcommands(root: ArgumentParser) -> list[str]:

@@ -119,7 +119,7 @@ def test_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["latency", "--times", str(wrong), *out]) == cli.EXIT_USAGE
     assert "does not hold recorded times" in capsys.readouterr().err
     assert cli.main(["latency", "--seeds", "0", *out]) == cli.EXIT_USAGE
-    assert "--seeds must be at least 1" in capsys.readouterr().err
+    assert "--seeds must be a whole number" in capsys.readouterr().err
     assert cli.main(["ablation", "--agent", "nobody", *out]) == cli.EXIT_USAGE
     assert "unknown agent 'nobody'" in capsys.readouterr().err
 

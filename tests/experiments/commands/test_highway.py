@@ -104,10 +104,10 @@ def test_a_drive_that_breaks_down_is_a_failed_one(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["--scene", "racetrak"], "nearest: racetrack"),
-        (["--seeds", "0"], "--seeds must be at least 1"),
+        (["--seeds", "0"], "--seeds must be a whole number"),
         (["--agents", "stanly"], "unknown agent 'stanly'"),
         (["--env", "lapss=2"], "lapss"),
-        (["--scene", "roundabout", "--laps", "2"], "laps must be at least 1"),
+        (["--scene", "roundabout", "--laps", "2"], "laps must be exactly 1"),
         (["--conditions", "rain"], "rain"),
     ],
 )

@@ -268,15 +268,15 @@ def test_switching(
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (["--episodes", "0"], "episodes must be at least 1, not 0"),
-        (["--candidates", "0"], "candidates must be at least 1, not 0"),
-        (["--seed", "-1"], "seed must not be negative, not -1"),
+        (["--episodes", "0"], "--episodes must be a whole number"),
+        (["--candidates", "0"], "--candidates must be a whole number"),
+        (["--seed", "-1"], "--seed must be a whole number from 0"),
         (["--spans", "1"], "--spans are numbers above 1 and at most 10000, or whole; not 1"),
         (["--spans", "ten"], "or whole; not ten"),
         (["--spans", "nan"], "or whole; not nan"),
         (["--conditions", "fog"], "fog"),
         (["--vehicle", "bicycle"], "bicycle"),
-        (["--threads", "0"], "threads must be from 1"),
+        (["--threads", "0"], "--threads must be a whole number"),
     ],
 )
 def test_errors(

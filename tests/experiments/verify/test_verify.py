@@ -400,9 +400,9 @@ def test_a_plan_that_is_no_optimum_is_bettered(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--states", "0"], "states must be at least 1"),
-        (["--workers", "0"], "workers must be at least 1"),
-        (["--seed", "-1"], "seed must not be negative"),
+        (["--states", "0"], "--states must be a whole number"),
+        (["--workers", "0"], "--workers must be a whole number"),
+        (["--seed", "-1"], "--seed must be a whole number from 0"),
         (["--solver", "agents.nmpc:Nothing"], "cannot be loaded"),
     ],
 )
