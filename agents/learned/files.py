@@ -1,8 +1,9 @@
-"""Files of policies: NAME.json describes a policy, NAME.safetensors has its network's numbers.
+"""Read files of policies: NAME.json describes one, a .safetensors beside it has its numbers.
 
-This is the common core; `Kind` says how the files of one kind of policy differ. Reading executes
-nothing: the files hold JSON and plain numbers, nothing is unpickled. NAME.json contains a digest of
-itself and one of the weights, so damaged or edited files are refused. The digests find accidents.
+`storage` writes them. This is the common core; `Kind` says how the files of one kind of policy
+differ. Reading executes nothing: the files hold JSON and plain numbers, nothing is unpickled.
+NAME.json contains a digest of itself and one of the weights, so damaged or edited files are
+refused. The digests find accidents.
 They do not keep anybody from writing another policy, but the worst it can do is to drive badly.
 
 A file that cannot be used is a ValueError of one line that names the file and says what to do.
@@ -19,10 +20,9 @@ from typing import Any
 import numpy as np
 import safetensors
 from numpy.typing import NDArray
-from safetensors.numpy import save
 
 from trajectories.arguments import shown
-from trajectories.fileio import checked, parse_json, read_bytes, write_atomically
+from trajectories.fileio import checked, parse_json, read_bytes
 
 MOST_WEIGHTS = 64 * 2**20
 """Largest .safetensors that is written or read, bytes."""
@@ -49,6 +49,9 @@ FAMILIES: Mapping[str, str] = {
 
 BESIDE = re.compile(r"[^/\\:\x00-\x1f\x7f\ud800-\udfff]+\.safetensors")
 """Allowed names of a weights file: in the folder of its spec, on every operating system."""
+
+DIGEST = re.compile(r"\.[0-9a-f]{16}$")
+"""End of a weights file's name without its suffix, see `storage`."""
 
 Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Weight (outputs, inputs) and bias (outputs,)."""
@@ -82,68 +85,13 @@ class Kind:
     stages: tuple[str, ...] = ()
 
 
-def write_files(
-    kind: Kind, file: str | Path, spec: Spec, training: Mapping[str, Any], tensors: Tensors
-) -> None:
-    """Write NAME.safetensors, then the NAME.json that refers to it, each atomically.
-
-    Parameters
-    ----------
-    kind
-        Kind of policy.
-    file
-        NAME.json.
-    spec
-        All of the spec but format, weights, training and digest; plain JSON.
-    training
-        Origin of the policy, plain JSON.
-    tensors
-        Content of NAME.safetensors.
-
-    Raises
-    ------
-    ValueError
-        If the name does not end in .json, or a file would be too large to be read again.
-    OSError
-        If a file cannot be written.
-    """
-    file = Path(file)
-    if file.suffix != ".json":
-        raise ValueError(f"{file}: a {kind.noun} is written to NAME.json, give it such a name")
-    beside = file.with_suffix(".safetensors")
-    if not BESIDE.fullmatch(beside.name):
-        raise ValueError(
-            f"{file.name!r} is no name for a {kind.noun}: leave out \\, : and the like"
-        )
-    weights = save(tensors)
-    whole: Spec = {
-        "format": kind.format,
-        **spec,
-        "weights": {
-            "file": beside.name, "sha256": hashlib.sha256(weights).hexdigest(),
-            "bytes": len(weights),
-        },
-        "training": training,
-    }  # fmt: skip
-    text = json.dumps({**whole, "digest": _digest(whole)}, indent=2, allow_nan=False) + "\n"
-    for content, most in ((weights, MOST_WEIGHTS), (text.encode(), MOST_SPEC)):
-        if len(content) > most:
-            raise ValueError(
-                f"{file}: {_too_large(len(content), most)}: make the {kind.noun} smaller"
-            )
-    write_atomically(beside, weights)
-    write_atomically(file, text.encode())
-
-
 def check_suffix(kind: Kind, file: Path) -> None:
     """Check that a file is a NAME.json; the error says which file to give instead."""
     if file.suffix == ".json":
         return
     if file.suffix == ".safetensors":
-        raise ValueError(
-            f"{file} holds a {kind.noun}'s weights alone: give its spec, "
-            f"{file.with_suffix('.json')}"
-        )
+        spec = file.with_name(f"{DIGEST.sub('', file.stem)}.json")
+        raise ValueError(f"{file} holds a {kind.noun}'s weights alone: give its spec, {spec}")
     raise ValueError(f"{file} is no {kind.noun} file: give the NAME.json that it was written to")
 
 
@@ -167,7 +115,7 @@ def read_spec(kind: Kind, file: Path) -> Spec:
     _check_keys(kind, file, "", spec, kind.keys | COMMON_KEYS)
     for name, keys in {**kind.objects, **OBJECTS}.items():
         _check_keys(kind, file, f"{name}.", spec[name], keys)
-    if spec["digest"] != _digest(spec):
+    if spec["digest"] != digest_of(spec):
         raise ValueError(
             f"{file} was changed since it was written: copy it anew, or write the {kind.noun} again"
         )
@@ -224,6 +172,21 @@ def read_tensors(kind: Kind, file: Path, spec: Spec) -> Tensors:
     return tensors
 
 
+def read_files(kind: Kind, file: Path) -> tuple[Spec, Tensors]:
+    """Read a policy's spec and its tensors, see `read_spec` and `read_tensors`.
+
+    A writer may replace both in between: then they are read again.
+    """
+    spec = read_spec(kind, file)
+    while True:
+        try:
+            return spec, read_tensors(kind, file, spec)
+        except ValueError:
+            before, spec = spec, read_spec(kind, file)
+            if spec == before:
+                raise
+
+
 def layer_tensors(layers: tuple[Layer, ...]) -> Tensors:
     """Name the weights and biases of layers as in a weights file."""
     return {
@@ -262,8 +225,8 @@ def canonical(value: object) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
-def _digest(spec: Spec) -> str:
-    """SHA-256 of a spec without its "digest"."""
+def digest_of(spec: Spec) -> str:
+    """Return the SHA-256 of a spec without its "digest"."""
     rest = {key: value for key, value in spec.items() if key != "digest"}
     return hashlib.sha256(canonical(rest).encode()).hexdigest()
 
@@ -276,10 +239,6 @@ def _content(file: Path, most: int, noun: str) -> bytes:
         raise ValueError(
             f"{error}: give the path of a {noun}, its .safetensors beside it"
         ) from None
-
-
-def _too_large(size: int, most: int) -> str:
-    return f"{size} bytes, at most {most} are allowed"
 
 
 def _check_keys(kind: Kind, file: Path, where: str, found: Any, known: frozenset[str]) -> None:

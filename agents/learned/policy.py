@@ -20,10 +20,9 @@ from agents.learned.files import (
     layer_tensors,
     layers_of,
     plain_json,
-    read_spec,
-    read_tensors,
-    write_files,
+    read_files,
 )
+from agents.learned.storage import write_files
 from lpv_track_env.observation import SCALARS, ObservationLayout
 from lpv_track_env.task import checked_period
 from trajectories.arguments import shown
@@ -163,7 +162,7 @@ class Policy:
 
 
 def write(policy: Policy, file: str | Path) -> None:
-    """Write NAME.json and, beside it, NAME.safetensors, each atomically.
+    """Write NAME.json and its weights beside it; a crash leaves this policy or the one before.
 
     Raises
     ------
@@ -208,9 +207,8 @@ def read(file: str | Path) -> Policy:
             f"trust it, lpv-track import-policy {file} --algorithm ppo --trust "
             f"--out {file.with_suffix('.json')}"
         )
-    spec = read_spec(POLICY, file)
+    spec, tensors = read_files(POLICY, file)
     layout = read_layout(file, spec)
-    tensors = read_tensors(POLICY, file, spec)
     try:
         return Policy(
             layout=layout,

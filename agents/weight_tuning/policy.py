@@ -23,9 +23,7 @@ from agents.learned.files import (
     layer_tensors,
     layers_of,
     plain_json,
-    read_spec,
-    read_tensors,
-    write_files,
+    read_files,
 )
 from agents.learned.policy import (
     checked_layers,
@@ -34,6 +32,7 @@ from agents.learned.policy import (
     layout_spec,
     read_layout,
 )
+from agents.learned.storage import write_files
 from agents.weight_tuning.choice import WeightChoice
 from agents.weight_tuning.features import SCALES, names, size
 from agents.weights import FORMAT as SCHEDULE
@@ -110,7 +109,7 @@ class WeightPolicy:
 
 
 def write(policy: WeightPolicy, file: str | Path) -> None:
-    """Write NAME.json and, beside it, NAME.safetensors, each atomically.
+    """Write NAME.json and its weights beside it; a crash leaves this policy or the one before.
 
     Raises
     ------
@@ -133,14 +132,13 @@ def read(file: str | Path) -> WeightPolicy:
         of the observation.
     """
     file = Path(file)
-    spec = read_spec(WEIGHT_POLICY, file)
+    spec, tensors = read_files(WEIGHT_POLICY, file)
     layout = read_layout(file, spec)
     choice = _choice(file, spec["choice"])
     if spec["features"] != _features(choice):
         raise ValueError(
             f"{file}: made for other features than this version's (names or scales): retrain it"
         )
-    tensors = read_tensors(WEIGHT_POLICY, file, spec)
     try:
         policy = WeightPolicy(
             choice=choice,

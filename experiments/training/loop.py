@@ -14,6 +14,7 @@ from stable_baselines3.common.logger import Logger, configure
 
 from agents.learned.policy import read as read_policy
 from agents.learned.policy import write as write_policy
+from agents.learned.storage import remove_files
 from experiments.jobs import checkpoint
 from experiments.jobs.job import (
     VALIDATION_EPISODES,
@@ -140,8 +141,7 @@ class Training(Job):
             write_policy(trainer.policy({}), candidate)
             validation = validate(trainer.settings, candidate)
         finally:
-            for file in (candidate, candidate.with_suffix(".safetensors")):
-                file.unlink(missing_ok=True)
+            remove_files(candidate)
         least = min((line["validation"]["loss"] for line in self.lines), default=math.inf)
         best = validation["loss"] < least
         origin = {"kept_at": line["steps"], "validation": validation}

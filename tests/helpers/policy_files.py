@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from tests.helpers import learned_policies, weight_policies
 
 Files = tuple[bytes, bytes]
 """Contents of a .json and of its .safetensors."""
+WEIGHTS_NAME = re.compile(r'"file": "(mine[^"/\\]*\.safetensors)"')
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class PolicyKind:
         """Contents of the two files of a small policy."""
         with tempfile.TemporaryDirectory() as folder:
             file = self.written(Path(folder), self.small())
-            return file.read_bytes(), file.with_suffix(".safetensors").read_bytes()
+            return file.read_bytes(), beside(file).read_bytes()
 
     def small(self) -> Any:
         return self.make(hidden=(3,), **self.varied)
@@ -96,8 +98,14 @@ def put(folder: Path, files: Files) -> Path:
     """Write the two files of a policy."""
     file = folder / "mine.json"
     file.write_bytes(files[0])
-    file.with_suffix(".safetensors").write_bytes(files[1])
+    named = WEIGHTS_NAME.search(files[0].decode(errors="replace"))
+    (folder / (named[1] if named else "mine.safetensors")).write_bytes(files[1])
     return file
+
+
+def beside(file: Path) -> Path:
+    """The weights file of a spec."""
+    return file.parent / json.loads(file.read_text())["weights"]["file"]
 
 
 def change(file: Path, edit: Callable[[dict[str, Any]], Any], *, digest: bool = True) -> None:
@@ -113,7 +121,7 @@ def change(file: Path, edit: Callable[[dict[str, Any]], Any], *, digest: bool = 
 
 def put_weights(file: Path, content: bytes) -> None:
     """Replace the weights, with the digests that then belong to them."""
-    file.with_suffix(".safetensors").write_bytes(content)
+    beside(file).write_bytes(content)
     sha = hashlib.sha256(content).hexdigest()
     change(file, lambda spec: spec["weights"].update(sha256=sha, bytes=len(content)))
 

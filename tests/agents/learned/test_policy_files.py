@@ -14,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save
 
-from agents.learned import files
+from agents.learned import files, storage
 from agents.learned import policy as policies
 from lpv_track_env import observation
 from lpv_track_env.observation import ObservationLayout
@@ -24,6 +24,7 @@ from tests.helpers.policy_files import (
     WEIGHTS,
     Files,
     PolicyKind,
+    beside,
     change,
     checked,
     each_kind,
@@ -62,8 +63,9 @@ def test_round_trip_bit_for_bit(origin: str, activation: str, squash: str, tmp_p
 @each_kind
 def test_the_same_policy_is_the_same_bytes(kind: PolicyKind, tmp_path: Path) -> None:
     one, other = kind.written(tmp_path / "a"), kind.written(tmp_path / "b")
-    for suffix in (".json", ".safetensors"):
-        assert one.with_suffix(suffix).read_bytes() == other.with_suffix(suffix).read_bytes()
+    assert one.read_bytes() == other.read_bytes()
+    assert beside(one).read_bytes() == beside(other).read_bytes()
+    assert beside(one).name == beside(other).name
 
 
 @each_kind
@@ -88,7 +90,7 @@ def test_weights_are_there_before_a_spec_names_them(
     kind: PolicyKind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     order: list[str] = []
-    monkeypatch.setattr(files, "write_atomically", lambda file, _: order.append(file.suffix))
+    monkeypatch.setattr(storage, "write_atomically", lambda file, _: order.append(file.suffix))
     kind.written(tmp_path)
     assert order == [".safetensors", ".json"]
 
@@ -237,9 +239,9 @@ def test_weights_of_another_policy_are_refused(
 ) -> None:
     layers = tuple((weight + 1.0, bias) for weight, bias in POLICIES[kind.noun].layers)
     other = kind.written(tmp_path / "other", kind.make(layers=layers))
-    shutil.copy(other.with_suffix(".safetensors"), file.with_suffix(".safetensors"))
+    shutil.copy(beside(other), beside(file))
     said = refusal(file, kind.read)
-    assert "mine.safetensors was changed since it was written" in said
+    assert f"{beside(file).name} was changed since it was written" in said
     assert "copy it anew, together with mine.json" in said
 
 
@@ -443,18 +445,16 @@ def test_weights_are_parsed_only_if_they_are_those_that_were_written(
 ) -> None:
     parsed: list[bytes] = []
     monkeypatch.setattr(files.safetensors, "deserialize", parsed.append)
-    beside = file.with_suffix(".safetensors")
-    content = bytearray(beside.read_bytes())
+    content = bytearray(beside(file).read_bytes())
     content[-1] ^= 1
-    beside.write_bytes(content)
+    beside(file).write_bytes(content)
     refusal(file, kind.read)
     assert parsed == []
 
 
 @each_kind
 def test_a_file_too_large_is_not_read(kind: PolicyKind, file: Path) -> None:
-    beside = file.with_suffix(".safetensors")
-    os.truncate(beside, 2**36)  # sparse: it takes no room, unless it is read
+    os.truncate(beside(file), 2**36)  # sparse: it takes no room, unless it is read
     assert "68719476736 bytes are too many: at most 67108864 are read" in refusal(file, kind.read)
     os.truncate(file, 2**36)
     for by in kind.readers:
@@ -467,8 +467,8 @@ def test_pipes_and_folders_are_not_waited_for(kind: PolicyKind, file: Path, tmp_
     for by in kind.readers:
         assert "Is a directory" in refusal(tmp_path / "folder.json", by)
     if hasattr(os, "mkfifo"):
-        file.with_suffix(".safetensors").unlink()
-        os.mkfifo(file.with_suffix(".safetensors"))
+        beside(file).unlink()
+        os.mkfifo(beside(file))
         assert "no regular file" in refusal(file, kind.read)
         os.mkfifo(tmp_path / "pipe.json")
         for by in kind.readers:

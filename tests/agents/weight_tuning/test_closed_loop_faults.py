@@ -15,9 +15,9 @@ from tests.helpers.nmpc_situations import WEIGHTS
 # Failing solves ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("entry", "value"), [(5, np.nan), (0, np.inf), (2, 1e20)])
+@pytest.mark.parametrize(("entry", "value"), [(5, np.nan), (0, np.inf)])
 def test_failing_solves_go_to_the_fallback_as_in_predict(entry: int, value: float) -> None:
-    """Not finite, or finite and beyond solving: plan, then a stop; Stanley without a plan."""
+    """Plan, then a stop; Stanley without a plan."""
     loop = loop_of(3, CALM, max_failures=3)
     turns = InTurns(3, CALM, None, max_failures=3)
     loop.reset(seed=9)
