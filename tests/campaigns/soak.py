@@ -43,6 +43,7 @@ CONDITIONS: tuple[Any, ...] = (
     *PRESETS, {"name": "realtime", "estimator": "raw"}, {"name": "realtime", "estimator": "truth"},
     {"name": "realtime", "gnss_dropout_rate": 0.5, "gnss_outlier_rate": 0.2, "gnss_noise": 1.0},
 )  # fmt: skip
+ERROR_RANGES = ((0, 0, 0), (1, 0.3, 2), (1000, 6.2, 100), (1e15, 1e15, 1e15))
 PLANTS = ("bicycle", "single-track", "drift", "multi-body")
 PLANTED = ("ford-escort", "bmw-320i", "vw-vanagon")
 """Vehicles that every plant knows."""
@@ -73,7 +74,7 @@ def settings(rng: np.random.Generator) -> Settings:
         "preview_period": None if rng.random() < 0.5 else float(rng.uniform(0.01, 0.2)),
         "max_lateral_error": float(rng.choice([0.5, 5.0, 1000.0])),
         "time_limit": None if rng.random() < 0.3 else float(rng.uniform(1.0, 30.0)),
-        "initial_error_range": ((0, 0, 0), (1, 0.3, 2), (1000, 6.2, 100))[rng.integers(3)],
+        "initial_error_range": ERROR_RANGES[rng.integers(len(ERROR_RANGES))],
         "random_start": bool(rng.random() < 0.7),
         "speed_mode": str(rng.choice(["variable", "fixed"])),
     }
@@ -103,7 +104,7 @@ def actions(rng: np.random.Generator, space: Any, rows: int) -> Array:
 
 def start(rng: np.random.Generator) -> Settings:
     """Draw reset options that are allowed, up to their bounds."""
-    scale = rng.choice([0.01, 1.0])
+    scale = rng.choice([0.01, 1.0, 1e12])
     drawn = scale * rng.uniform(-1.0, 1.0, 3) * (1000.0, 6.28, 100.0)
     errors = zip(("lateral_error", "heading_error", "speed_error"), drawn.tolist(), strict=True)
     return {key: value for key, value in errors if rng.random() < 0.7}
