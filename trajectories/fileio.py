@@ -27,6 +27,16 @@ LARGEST_INTEGER = 2**63 - 1
 """Largest integer in JSON, as in a 64-bit integer of NumPy."""
 
 
+def file_name(name: str) -> str:
+    """Return a name from anywhere as the stem of a file's name: never a path, on any system.
+
+    All but letters, digits and `_+=@.` becomes "-", dots at the ends are left out, and at most 60
+    characters are kept; an empty name becomes "unnamed". Different names may become equal.
+    """
+    kept = "".join(c if c.isalnum() or c in "_+=@." else " " for c in name)
+    return "-".join(kept.split())[:60].strip(".-") or "unnamed"
+
+
 def read_bytes(file: str | Path, limit: int = MOST_BYTES) -> bytes:
     """Read a regular file of at most `limit` bytes.
 

@@ -60,12 +60,31 @@ def run(options: argparse.Namespace, console: Console) -> int:
         from trajectories.files import write
 
         options.write.mkdir(parents=True, exist_ok=True)
-        for path in paths:
-            write(path, options.write / f"{path.name}.csv")
+        for name, path in _file_names(paths).items():
+            write(path, options.write / name)
         console.print(
             f"{len(paths)} paths written to {options.write}", markup=False, soft_wrap=True
         )
     return 0
+
+
+def _file_names(paths: Sequence["ReferencePath"]) -> dict[str, "ReferencePath"]:
+    """Return the name of each path's file and its path; a path's name may be from a file.
+
+    Raises
+    ------
+    ValueError
+        If two paths would have one file.
+    """
+    from trajectories.fileio import file_name, shown
+
+    named: dict[str, ReferencePath] = {}
+    for path in paths:
+        name = f"{file_name(path.name)}.csv"
+        if name.lower() in {other.lower() for other in named}:
+            raise ValueError(f"two paths would be written to {name}, one is {shown(path.name)}")
+        named[name] = path
+    return named
 
 
 def rows_table(paths: Sequence["ReferencePath"]) -> Table:

@@ -21,6 +21,7 @@ from experiments.ros.messages import (
     typestore,
 )
 from experiments.ros.topics import Topic
+from trajectories.fileio import shortened
 
 T = TypeVar("T", bound=Topic)
 Array = NDArray[np.float64]
@@ -41,7 +42,7 @@ class BagError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(printable(message).split()))
+        super().__init__(shortened(printable(message), 400))
 
 
 def printable(text: str) -> str:
@@ -282,12 +283,11 @@ def _opened(file: Path) -> Iterator[tuple[Any, int, str]]:
 
 def _recognise(file: Path) -> tuple[int, str]:
     """Return ROS version and storage of a bag, by its content."""
-    if file.is_dir():
-        if not (file / "metadata.yaml").is_file():
-            raise BagError(f"{file} is no ROS 2 bag: there is no metadata.yaml in the folder")
-        by_name = any(".mcap" in entry.name for entry in file.iterdir())
-        return ROS2, "mcap" if by_name else "sqlite3"
     try:
+        if file.is_dir():
+            return ROS2, _storage_in(file)
+        if file.exists() and not file.is_file():
+            raise BagError(f"{file}: cannot be read: it is a pipe or device, no regular file")
         with file.open("rb") as handle:
             begin = handle.read(16)
     except OSError as error:
@@ -302,3 +302,13 @@ def _recognise(file: Path) -> tuple[int, str]:
             raise BagError(f"{file}: a ROS 2 file of {storage} must be named NAME{suffix}")
         return ros, storage
     raise BagError(f"{file} is no ROS bag (a .bag file, a ROS 2 bag's folder, .db3 or .mcap)")
+
+
+def _storage_in(folder: Path) -> str:
+    """Return the storage of a ROS 2 bag's folder, which must hold regular files."""
+    entries = list(folder.iterdir())
+    if not (folder / "metadata.yaml").is_file():
+        raise BagError(f"{folder} is no ROS 2 bag: there is no metadata.yaml in the folder")
+    if special := [entry for entry in entries if not entry.is_file() and not entry.is_dir()]:
+        raise BagError(f"{special[0]}: cannot be read: it is a pipe or device, no regular file")
+    return "mcap" if any(".mcap" in entry.name for entry in entries) else "sqlite3"

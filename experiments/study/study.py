@@ -25,7 +25,7 @@ from experiments.run.store import write_arrays
 from experiments.study.evaluation import FIGURES, EvaluationSet, Evaluator
 from experiments.tuning.loop import WEIGHTS, tune
 from experiments.tuning.settings import TuningSettings, usual
-from trajectories.fileio import checked, read_json, write_atomically
+from trajectories.fileio import checked, file_name, read_json, write_atomically
 from trajectories.naming import choose
 
 Array = NDArray[Any]
@@ -207,11 +207,6 @@ class Study:
         """Read the lines of a training's progress; none for the default weights."""
         folder = self.training(label, seed)
         return read_lines(folder) if (folder / PROGRESS).exists() else []
-
-
-def file_name(name: str) -> str:
-    """Return a name without commas and spaces."""
-    return name.replace(", ", "-").replace(" ", "-")
 
 
 def read_figures(file: Path) -> Figures:
