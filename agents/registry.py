@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import CHECKPOINTS, Action, Agent, DrivingTask
+from trajectories.arguments import shown
 from trajectories.naming import suggestion
 
 REGISTRY: dict[str, str] = {
@@ -62,7 +63,7 @@ def agent_class(name: str) -> Callable[..., Any]:
     module, separator, attribute = target.rpartition(":")
     if not separator:
         raise ValueError(
-            f"unknown agent {name!r}; {suggestion(name, REGISTRY)}, "
+            f"unknown agent {shown(name)}; {suggestion(name, REGISTRY)}, "
             "or give your own as file.py:Class or module:Class, a learned policy as its .json"
         )
     try:
@@ -71,7 +72,7 @@ def agent_class(name: str) -> Callable[..., Any]:
         else:
             found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, OSError, SyntaxError) as error:
-        raise ValueError(f"agent {name!r} cannot be loaded: {error}") from error
+        raise ValueError(f"agent {shown(name)} cannot be loaded: {error}") from error
     return found
 
 
@@ -143,7 +144,7 @@ def check_settings(name: str, settings: Iterable[str]) -> None:
     for key in settings:
         if key not in (*known, *COMMON):
             hint = f"; {suggestion(key, known)}" if known else ""
-            raise ValueError(f"agent {name!r} has no setting {key!r}{hint}")
+            raise ValueError(f"agent {shown(name)} has no setting {shown(key)}{hint}")
 
 
 def make(
@@ -182,7 +183,7 @@ def make(
         task = DrivingTask.of(env)
         agent: Agent = cls(task, **settings)
     except TypeError as error:
-        raise ValueError(f"agent {name!r}: {error}") from error
+        raise ValueError(f"agent {shown(name)}: {error}") from error
     wanted = task.delayed if delay_compensation is None else delay_compensation
     if wanted and not compensates:
         from agents.delay import DelayCompensated

@@ -18,7 +18,7 @@ from lpv_track_env.reward import RewardWeights
 from lpv_track_env.validation import LARGEST_ERROR
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
-from trajectories.arguments import Number, flag, instance_of, numbers
+from trajectories.arguments import Number, flag, instance_of, numbers, shown
 from trajectories.naming import choose
 from trajectories.projection import tightest_turn
 from trajectories.speed import constant_speed
@@ -61,7 +61,7 @@ def reference(
         raise ValueError("fixed_speed needs speed_mode='fixed'")
     fastest = parameters.speed_range[1]
     if path.speed.max() > fastest:
-        message = f"path {path.name!r}: speed lowered to the vehicle's {fastest:g} m/s"
+        message = f"path {shown(path.name)}: speed lowered to the vehicle's {fastest:g} m/s"
         warnings.warn(message, UserWarning, stacklevel=4)
         noted = [*path.metadata.get("warnings", []), message]
         path = path.with_speed(np.minimum(path.speed, fastest), warnings=noted)

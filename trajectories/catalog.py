@@ -94,9 +94,8 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
     Raises
     ------
     ValueError
-        For an unknown name (the message lists the known ones and the nearest) or a bad file.
-    TypeError
-        For anything but text, a file or a path, such as an array.
+        For an unknown name (the message lists the known ones and the nearest), a bad file, or
+        anything else, such as an array.
     """
     if isinstance(trajectory, ReferencePath):
         return trajectory

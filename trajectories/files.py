@@ -91,9 +91,9 @@ def _comment(key: str, value: object) -> str:
     try:
         line = f"# {key}: {json.dumps(value, allow_nan=False, default=_plain)}"
     except (TypeError, ValueError) as error:
-        raise ValueError(f"metadata[{key!r}] cannot be written as JSON: {error}") from error
+        raise ValueError(f"metadata[{shown(key)}] cannot be written as JSON: {error}") from error
     if _COMMENT.fullmatch(line) is None:
-        raise ValueError(f"metadata key {key!r} must be a word")
+        raise ValueError(f"metadata key {shown(key)} must be a word")
     return line
 
 

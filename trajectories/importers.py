@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from trajectories.arguments import shown
 from trajectories.geodesy import east_north_up
 from trajectories.path import MINIMUM_POINTS, SPACING, ReferencePath
 from trajectories.shapes import Geometry, from_geometry, smooth
@@ -204,7 +205,7 @@ def _times(table: TextTable, index: int) -> Array:
         try:
             stamps[k] = datetime.fromisoformat(row[index].strip('"')).timestamp()
         except (ValueError, OverflowError, OSError):
-            table.fail(f"line {table.lines[k]}: {row[index][:40]!r} is not a time")
+            table.fail(f"line {table.lines[k]}: {shown(row[index])} is not a time")
     return stamps
 
 

@@ -25,7 +25,7 @@ from agents.learned.files import (
 from agents.learned.storage import write_files
 from lpv_track_env.observation import SCALARS, ObservationLayout
 from lpv_track_env.task import checked_period
-from trajectories.arguments import shown
+from trajectories.arguments import shortened, shown
 from trajectories.naming import choose
 
 Weights = NDArray[np.float32]
@@ -130,7 +130,7 @@ class Policy:
             raise ValueError(f"half must not be negative, but is {half.tolist()}")
         if not isinstance(self.symmetric, bool):
             raise ValueError(  # noqa: TRY004  one type of error for all fields
-                f"symmetric must be true or false, not {self.symmetric!r}"
+                f"symmetric must be true or false, not {shown(self.symmetric)}"
             )
         if self.symmetric and centre[1] != 0.0:
             raise ValueError(f"a symmetric policy steers about 0, not about {centre[1]} rad")
@@ -218,7 +218,7 @@ def read(file: str | Path) -> Policy:
             **{key: spec[key] for key in POLICY.keys | {"algorithm", "control_period", "training"}},
         )
     except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
+        raise ValueError(f"{file}: {shortened(error)}") from error
 
 
 def layout_spec(layout: ObservationLayout) -> Spec:
@@ -242,7 +242,7 @@ def read_layout(file: Path, spec: Spec) -> ObservationLayout:
     try:
         layout = ObservationLayout(steps, period)
     except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
+        raise ValueError(f"{file}: {shortened(error)}") from error
     if described == layout_spec(layout):
         return layout
     before, now = described["entries"], layout_spec(layout)["entries"]
@@ -259,14 +259,14 @@ def read_layout(file: Path, spec: Spec) -> ObservationLayout:
 def checked_name(algorithm: object) -> str:
     """Check that a policy's `algorithm` is a string that is not empty."""
     if not isinstance(algorithm, str) or not algorithm.strip():
-        raise ValueError(f"algorithm must be a name, not {algorithm!r}")
+        raise ValueError(f"algorithm must be a name, not {shown(algorithm)}")
     return algorithm
 
 
 def checked_number(name: str, value: Any) -> float:
     """Convert a finite number to a float; booleans are refused."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise ValueError(f"{name} must be a number, not {value!r}")  # noqa: TRY004
+        raise ValueError(f"{name} must be a number, not {shown(value)}")  # noqa: TRY004
     try:
         number = float(value)
     except OverflowError:
@@ -280,7 +280,7 @@ def _array(name: str, value: ArrayLike, dtype: type[np.floating[Any]]) -> NDArra
     try:
         given = np.asarray(value)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} is not an array of numbers: {error}") from error
+        raise ValueError(f"{name} is not an array of numbers: {shortened(error)}") from error
     if given.dtype.kind not in "fiu":
         raise ValueError(f"{name} is not an array of numbers, but of {given.dtype}")
     with np.errstate(over="ignore"):  # becomes infinite, which is refused below

@@ -39,7 +39,7 @@ from agents.weights import FORMAT as SCHEDULE
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.task import checked_period
-from trajectories.arguments import shown
+from trajectories.arguments import shortened, shown
 
 WEIGHT_POLICY = Kind(
     format="lpv-track-weights/1",
@@ -149,7 +149,7 @@ def read(file: str | Path) -> WeightPolicy:
             training=spec["training"],
         )
     except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
+        raise ValueError(f"{file}: {shortened(error)}") from error
     _check_as_written(file, spec, policy)
     return policy
 
@@ -210,7 +210,7 @@ def _choice(file: Path, spec: Spec) -> WeightChoice:
         place = "choice"
         return WeightChoice(base, spec["directions"], spec["span"], catalogue, spec["window"])
     except (ValueError, TypeError, OverflowError) as error:
-        raise ValueError(f"{file}: {place}: {' '.join(str(error).split())}") from error
+        raise ValueError(f"{file}: {place}: {shortened(error)}") from error
 
 
 def _check_as_written(file: Path, spec: Spec, policy: WeightPolicy) -> None:

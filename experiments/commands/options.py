@@ -10,6 +10,8 @@ from typing import Any
 
 from rich.console import Console
 
+from trajectories.arguments import shown
+
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
@@ -288,8 +290,8 @@ def agent_settings(pairs: Sequence[str], agents: Iterable[str]) -> dict[str, dic
         named = any(isinstance(default, str | Path) for default in defaults.values())
         if named and len({repr(default) for default in defaults.values()}) > 1:
             raise ValueError(
-                f"setting {key!r} has different defaults for {', '.join(defaults)}: say whose it "
-                f"is, as --agent-set {next(iter(defaults))}:{key}=..."
+                f"setting {shown(key)} has different defaults for {', '.join(defaults)}: say whose "
+                f"it is, as --agent-set {next(iter(defaults))}:{key}=..."
             )
     for name in names:
         try:

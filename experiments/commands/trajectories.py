@@ -76,7 +76,8 @@ def _file_names(paths: Sequence["ReferencePath"]) -> dict[str, "ReferencePath"]:
     ValueError
         If two paths would have one file.
     """
-    from trajectories.fileio import file_name, shown
+    from trajectories.arguments import shown
+    from trajectories.fileio import file_name
 
     named: dict[str, ReferencePath] = {}
     for path in paths:

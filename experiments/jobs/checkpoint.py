@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from trajectories.arguments import shown
 from trajectories.fileio import write_atomically
 
 FORMAT = "lpv-track-checkpoint/1"
@@ -36,7 +37,7 @@ def read(folder: Path) -> dict[str, Any] | None:
     try:
         content: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
         if content["format"] != FORMAT:
-            raise ValueError(f"its format is {content['format']!r}, not {FORMAT!r}")
+            raise ValueError(f"its format is {shown(content['format'])}, not {FORMAT!r}")
     except (
         pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError, OSError,
         zipfile.BadZipFile,

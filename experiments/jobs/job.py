@@ -21,6 +21,7 @@ from experiments.run.folder_lock import locked
 from experiments.run.provenance import file_digest
 from experiments.run.suites import HELD_OUT, SIX
 from trajectories import ReferencePath
+from trajectories.arguments import shown
 from trajectories.fileio import checked, parse_json, read_bytes, read_json, write_atomically
 
 SETTINGS, PROGRESS = "settings.json", "progress.jsonl"
@@ -170,7 +171,7 @@ def difference(settings: Settings, stored: Mapping[str, Any]) -> str | None:
     """Describe the first difference between settings and stored ones; None if they are equal."""
     for key, value in settings.as_dict().items():
         if stored.get(key) != value:
-            return f"{key} is {value!r}, there {stored.get(key)!r}"
+            return f"{key} is {shown(value)}, there {shown(stored.get(key))}"
     return None
 
 

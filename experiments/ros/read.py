@@ -21,7 +21,7 @@ from experiments.ros.messages import (
     typestore,
 )
 from experiments.ros.topics import Topic
-from trajectories.fileio import shortened
+from trajectories.arguments import shortened
 
 T = TypeVar("T", bound=Topic)
 Array = NDArray[np.float64]

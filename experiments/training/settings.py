@@ -13,6 +13,7 @@ from experiments.jobs.job import check_paths, plain_values
 from experiments.training import ALGORITHMS
 from lpv_track_env import conditions, vehicle
 from lpv_track_env.reward import RewardWeights
+from trajectories.arguments import shown
 from trajectories.naming import choose
 
 PPO = {
@@ -147,7 +148,7 @@ class TrainingSettings:
         for key, value in self.reward.items():
             choose("reward weight", key, tuple(item.name for item in fields(RewardWeights)))
             if isinstance(value, bool) or not isinstance(value, int | float):
-                raise ValueError(f"reward weight {key} must be a number, not {value!r}")  # noqa: TRY004
+                raise ValueError(f"reward weight {key} must be a number, not {shown(value)}")  # noqa: TRY004
         return RewardWeights(**self.reward)
 
     @property
@@ -224,4 +225,4 @@ def _check(key: str, value: Any, usual: Any) -> None:
         if good and not least <= value <= most:
             raise ValueError(f"hyperparameter {key} must be in [{least}, {most}], not {value}")
     if not good:
-        raise ValueError(f"hyperparameter {key} must be like {usual!r}, not {value!r}")
+        raise ValueError(f"hyperparameter {key} must be like {usual!r}, not {shown(value)}")

@@ -34,6 +34,7 @@ from agents.weights import WeightSchedule
 from experiments.tuning.settings import TuningSettings
 from experiments.tuning.tuner import Tuner, TuningDrives, schedule_of, unusable, weights_at
 from trajectories import CurvatureBands, ReferencePath
+from trajectories.arguments import shown
 from trajectories.fileio import read_json, write_atomically
 
 Array = NDArray[Any]
@@ -72,7 +73,7 @@ class ReplayedTuner(Tuner):
         try:
             content = read_json(file)
             if content["format"] != FORMAT:
-                raise ValueError(f"its format is {content['format']!r}, not {FORMAT!r}")
+                raise ValueError(f"its format is {shown(content['format'])}, not {FORMAT!r}")
             self.replay(content)
         except KeyError as error:
             raise ValueError(unusable(file, f"no {error} in it")) from None

@@ -11,6 +11,7 @@ from experiments.jobs.job import check_paths, plain_values
 from experiments.training.settings import LEAST, MOST
 from experiments.tuning import METHODS
 from lpv_track_env import conditions, vehicle
+from trajectories.arguments import shown
 from trajectories.naming import choose
 
 PPO_METHODS = ("catalogue", "rl")
@@ -149,4 +150,4 @@ def _check(key: str, value: Any, usual_value: Any) -> None:
         if good and not least <= value <= most:
             raise ValueError(f"hyperparameter {key} must be in [{least}, {most}], not {value}")
     if not good:
-        raise ValueError(f"hyperparameter {key} must be like {usual_value!r}, not {value!r}")
+        raise ValueError(f"hyperparameter {key} must be like {usual_value!r}, not {shown(value)}")

@@ -109,7 +109,7 @@ class Scene:
         config: dict[str, Any] = {**self.config, "observation": dict(observation)}
         if other_vehicles is not None:
             if self.traffic is None:
-                raise ValueError(f"scene {self.name!r} has its own number of other vehicles")
+                raise ValueError(f"scene {shown(self.name)} has its own number of other vehicles")
             config[self.traffic] = OTHER_VEHICLES.of("other_vehicles", other_vehicles)
         if isinstance(self.road, str):
             made: AbstractEnv = gymnasium.make(
@@ -219,7 +219,7 @@ class NetworkEnv(AbstractEnv):
         self._network, self._route = network, tuple(route)
         for begin, end in pairwise(self._route):
             if not network.graph.get(begin, {}).get(end):
-                raise ValueError(f"the network has no road from {begin!r} to {end!r}")
+                raise ValueError(f"the network has no road from {shown(begin)} to {shown(end)}")
         super().__init__(dict(config))
 
     @classmethod

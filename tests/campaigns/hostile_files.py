@@ -208,7 +208,9 @@ def _jobs() -> Reader:
     seed = {
         "settings.json": json.dumps(usual("ppo").as_dict()).encode(),
         "progress.jsonl": (json.dumps(line) + "\n").encode() * 3,
-        "times.json": json.dumps({"ekf": [0.001] * 4, "lpv-nmpc": [0.002] * 4, "lpv-nmpc-ipopt": [0.02] * 4}).encode(),
+        "times.json": json.dumps(
+            {"ekf": [0.001] * 4, "lpv-nmpc": [0.002] * 4, "lpv-nmpc-ipopt": [0.02] * 4}
+        ).encode(),
         "figures.npz": figures.getvalue(),
     }
     mutations = {name: BYTES if name.endswith("npz") else JSON for name in seed}
