@@ -121,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return EXIT_FAILED
         from trajectories.arguments import shortened
 
-        print("lpv-track:", shortened(error), file=sys.stderr)
+        print("lpv-track:", shortened(error, 1000), file=sys.stderr)
         return EXIT_USAGE
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
