@@ -144,7 +144,7 @@ def observation_space(choice: WeightChoice) -> spaces.Box:
     return spaces.Box(-LIMIT, LIMIT, shape, dtype=np.float32)
 
 
-def action_space(choice: WeightChoice) -> spaces.Box | spaces.Discrete[np.int64]:
+def action_space(choice: WeightChoice) -> "spaces.Box | spaces.Discrete[np.int64]":
     """Return the space of the actions of a choice."""
     if choice.catalogue:
         return spaces.Discrete(len(choice.catalogue))

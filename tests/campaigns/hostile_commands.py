@@ -66,7 +66,10 @@ LONG: dict[str, tuple[str, ...]] = {
     "verify": ("experiments.commands.verify._measure",),
     "tuning-study": ("experiments.study.study.run_trainings",),
     "switching": ("experiments.study.weight_switching.drive_arm",),
-    "run-parallel": ("experiments.parallel.supervisor.run",),
+    "run-parallel": (
+        "experiments.parallel.supervisor.run",
+        "experiments.parallel.mailbox_bench.bench_mailbox",
+    ),
 }
 """Functions with which the long work of a command begins."""
 
