@@ -89,7 +89,7 @@ docs: setup-docs
 
 lock: $(BIN)/python
 	$(PIP) install uv
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python requirements/lock.py
+	$(BIN)/python requirements/lock.py
 
 clean:
 	rm -rf $(VENV) build results .mypy_cache .ruff_cache .pytest_cache

@@ -160,7 +160,7 @@ def numbers(name: str, value: Any, rule: Number, count: int) -> tuple[float, ...
     ValueError
         Naming the argument, if there are more or fewer, or one is not within the bounds.
     """
-    given = value.tolist() if getattr(value, "ndim", None) == 1 else value
+    given = value.tolist() if isinstance(value, np.ndarray) else value
     if not isinstance(given, list | tuple) or len(given) != count:
         raise ValueError(f"{name} must be {count} numbers, each {rule}, not {shown(value)}")
     return tuple(rule.of(f"{name}[{k}]", one) for k, one in enumerate(given))

@@ -34,7 +34,10 @@ FORMULA_SIZE = 17
 """px."""
 FETCHED = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
 COMMANDS = "<!-- commands -->"
-FROM_ROOT = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+FROM_ROOT = {
+    "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "security.md",
+}  # fmt: skip
 
 
 def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:
