@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from trajectories.arguments import shown
+from trajectories.arguments import shortened, shown
 from trajectories.fileio import write_atomically
 
 FORMAT = "lpv-track-checkpoint/1"
@@ -43,8 +43,14 @@ def read(folder: Path) -> dict[str, Any] | None:
         zipfile.BadZipFile,
     ) as error:  # fmt: skip
         # PyTorch's own message is many lines long and advises loading the file unsafely.
-        reason = error if isinstance(error, ValueError) else type(error).__name__
-        raise ValueError(
-            f"{file} cannot be read ({reason}): remove it, and the training begins anew"
-        ) from None
+        reason = str(error) if isinstance(error, ValueError) else type(error).__name__
+        raise ValueError(unusable(folder, reason)) from None
     return content
+
+
+def unusable(folder: Path, reason: str) -> str:
+    """Return the message for a checkpoint that a training cannot go on from, in one line."""
+    return (
+        f"{folder / NAME} cannot be read ({shortened(reason)}): remove it, and the training begins "
+        "anew"
+    )

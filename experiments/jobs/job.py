@@ -18,13 +18,13 @@ from typing import Any, Protocol, Required, TypedDict
 import trajectories
 from experiments.run.engines import Interrupts
 from experiments.run.folder_lock import locked
-from experiments.run.provenance import file_digest
+from experiments.run.provenance import COMPUTING, computing_versions, file_digest
 from experiments.run.suites import HELD_OUT, SIX
 from trajectories import ReferencePath
 from trajectories.arguments import shown
 from trajectories.fileio import checked, parse_json, read_bytes, read_json, write_atomically
 
-SETTINGS, PROGRESS = "settings.json", "progress.jsonl"
+SETTINGS, PROGRESS, VERSIONS = "settings.json", "progress.jsonl", "versions.json"
 
 Line = dict[str, Any]
 
@@ -128,21 +128,42 @@ def run_job(
 
 
 @contextlib.contextmanager
-def claimed(folder: Path, settings: Settings, kind: str) -> Iterator[bool]:
+def claimed(
+    folder: Path, settings: Settings, kind: str, packages: Sequence[str] = ()
+) -> Iterator[bool]:
     """Make a folder a job's own; the value is True if it holds the same job already.
 
-    `kind` is "training" or "tuning", for the messages.
+    `kind` is "training" or "tuning", for the messages; `packages` compute in it, beside those that
+    compute everything.
 
     Raises
     ------
     ValueError
-        If another process uses the folder, or it holds a job with other settings.
+        If another process uses the folder, or it holds a job with other settings, or of other
+        versions: half of its steps would be of either, and nobody could repeat it.
     """
     with locked(folder):
         stored = stored_settings(folder, kind)
         if stored is not None and (differs := difference(settings, stored)):
             raise ValueError(f"{folder} holds a {kind} with other settings: {differs}")
+        _check_versions(folder, kind, packages, begun=stored is not None)
         yield stored is not None
+
+
+def _check_versions(folder: Path, kind: str, packages: Sequence[str], *, begun: bool) -> None:
+    """Write the versions of what computes, or compare them with those that a job began with."""
+    file, own = folder / VERSIONS, computing_versions(*COMPUTING, *packages)
+    if not (begun and file.exists()):
+        # A folder of an earlier version of this project has no such file.
+        write_atomically(file, json.dumps(own, indent=2).encode())
+        return
+    begun_with = checked(read_json(file), dict[str, str], file)
+    for name, version in own.items():
+        if (then := begun_with.get(name, version)) != version:
+            raise ValueError(
+                f"{folder} holds a {kind} made with {name} {then}, here is {version}: install that "
+                f"one, give another --out, or remove {VERSIONS} to go on all the same"
+            )
 
 
 def stored_settings(folder: Path, kind: str) -> Mapping[str, Any] | None:

@@ -10,7 +10,6 @@ import io
 import json
 import os
 import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from experiments.run.provenance import command_line, manifest_key, provenance
 from experiments.run.result_schema import Case, read_case
+from trajectories.arguments import shortened
 from trajectories.fileio import checked, read_bytes, read_json, write_atomically
 
 Array = NDArray[np.float64]
@@ -38,6 +38,26 @@ def write_arrays(file: Path, arrays: Mapping[str, Any]) -> None:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomically(file, buffer.getvalue())
+
+
+def read_arrays(file: Path, limit: int = LARGEST_TRACE) -> dict[str, Any]:
+    """Read arrays by name from an .npz of at most `limit` bytes, packed and unpacked.
+
+    Raises
+    ------
+    ValueError
+        In one line that begins with the file's name, if it cannot be read.
+    """
+    content = io.BytesIO(read_bytes(file, limit))
+    try:
+        with zipfile.ZipFile(content) as packed:
+            size = sum(entry.file_size for entry in packed.infolist())
+        if size > limit:
+            raise ValueError(f"{size} bytes are too many")
+        with np.load(content, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except Exception as error:  # noqa: BLE001  anything can be wrong with a damaged archive
+        raise ValueError(f"{file}: holds no arrays ({shortened(error)})") from None
 
 
 class ResultStore:
@@ -122,15 +142,9 @@ class ResultStore:
 
         Arrays hold finite numbers.
         """
-        file = self.folder / "traces" / f"{case_id}.npz"
         try:
-            content = io.BytesIO(read_bytes(file, LARGEST_TRACE))
-            with zipfile.ZipFile(content) as packed:
-                if sum(entry.file_size for entry in packed.infolist()) > LARGEST_TRACE:
-                    return None
-            with np.load(content, allow_pickle=False) as arrays:
-                trace = {name: arrays[name] for name in arrays.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError):
+            trace = read_arrays(self.folder / "traces" / f"{case_id}.npz")
+        except ValueError:
             return None
         if not all(array.dtype.kind in "fiu" and _finite(array) for array in trace.values()):
             return None

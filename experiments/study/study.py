@@ -6,8 +6,6 @@ with the evaluation of each. Only what is missing is made, so a study resumes wh
 """
 
 import json
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,10 +19,11 @@ from agents.weight_tuning.policy import load
 from experiments.jobs.job import PROGRESS, Line, Listener, read_lines
 from experiments.run.engines import local_pool
 from experiments.run.folder_lock import locked
-from experiments.run.store import write_arrays
+from experiments.run.store import read_arrays, write_arrays
 from experiments.study.evaluation import FIGURES, EvaluationSet, Evaluator
 from experiments.tuning.loop import WEIGHTS, tune
 from experiments.tuning.settings import TuningSettings, usual
+from trajectories.arguments import shortened
 from trajectories.fileio import checked, file_name, read_json, write_atomically
 from trajectories.naming import choose
 
@@ -218,12 +217,11 @@ def read_figures(file: Path) -> Figures:
         In one line, if the file cannot be used.
     """
     try:
-        with np.load(file, allow_pickle=False) as content:
-            return {name: content[name] for name in FIGURES}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        reason = " ".join(str(error).split())
+        content = read_arrays(file)
+        return {name: content[name] for name in FIGURES}
+    except (ValueError, KeyError) as error:
         raise ValueError(
-            f"{file} cannot be used ({reason}): remove it, and it is made anew"
+            f"{file} cannot be used ({shortened(error)}): remove it, and it is made anew"
         ) from None
 
 

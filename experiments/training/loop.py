@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ from experiments.training.sb3_trainer import Sb3Trainer
 from experiments.training.settings import TrainingSettings
 from experiments.training.trainer import Trainer, make_learner_env
 from lpv_track_env import vehicle
+from trajectories.fileio import checked
 
 POLICY = "policy.json"
 
@@ -89,7 +90,11 @@ def train(
     KeyboardInterrupt
         On Ctrl-C; the last checkpoint is kept.
     """
-    with claimed(folder, settings, "training") as resumed, contextlib.ExitStack() as closing:
+    packages = "torch", "stable-baselines3"
+    with (
+        claimed(folder, settings, "training", packages) as resumed,
+        contextlib.ExitStack() as closing,
+    ):
         paths = load_paths(path_names(settings), listener.loading)
         logger = configure(str(folder / "tensorboard"), ["tensorboard"])
         closing.callback(logger.close)
@@ -99,6 +104,17 @@ def train(
         if resumed:
             training.restore(folder)
         return run_job(training, folder, listener, seconds_at_most=seconds_at_most)
+
+
+class TrainingLine(TypedDict):
+    """Entries of a line that later ones and the figure are made from."""
+
+    seconds: float
+    learning_seconds: float
+    steps: int
+    solves: int
+    best: bool
+    validation: dict[str, float]
 
 
 class Training(Job):
@@ -184,7 +200,13 @@ class Training(Job):
         stored = checkpoint.read(folder)
         if stored is None:
             return False
-        self.trainer.restore(stored["trainer"])
+        try:
+            self.trainer.restore(stored["trainer"])
+            checked(stored["lines"], list[TrainingLine], "lines")
+        except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
+            # PyTorch writes a line for every layer that does not fit.
+            reason = str(error).split("\n", 1)[0]
+            raise ValueError(checkpoint.unusable(folder, reason)) from None
         self.lines = stored["lines"]
         return True
 

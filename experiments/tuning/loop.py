@@ -62,7 +62,8 @@ def tune(settings: TuningSettings, folder: Path, listener: Listener, *, command:
     KeyboardInterrupt
         On Ctrl-C; the folder keeps every step but the interrupted one.
     """
-    with claimed(folder, settings, "tuning") as resumed:
+    packages = ("torch", "stable-baselines3") if settings.method in PPO_METHODS else ("cma",)
+    with claimed(folder, settings, "tuning", packages) as resumed:
         if settings.method == "fixed":
             bands = CurvatureBands()
             default = WeightSchedule(

@@ -9,7 +9,6 @@ action that minimises it.
 """
 
 import math
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ from agents.weight_tuning.features import subset_mask
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import FAILED, SCALES, failed, rms_so_far, scores_of, squares_of
 from experiments.jobs.job import episode_seed
-from experiments.run.store import write_arrays
+from experiments.run.store import read_arrays, write_arrays
 from experiments.tuning.settings import TuningSettings
 from experiments.tuning.tuner import Array, Tuner, choice_of, environments, threads, unusable
 from trajectories import ReferencePath
@@ -312,15 +311,15 @@ class PairedLearning(Tuner):
             "products": model.products, "numbers": np.zeros(6),
         }  # fmt: skip
         try:
-            with np.load(file, allow_pickle=False) as content:
-                kept = {name: content[name] for name in wanted}
+            content = read_arrays(file)
+            kept = {name: content[name] for name in wanted}
             for name, like in wanted.items():
                 given = kept[name]
                 if given.shape != like.shape or given.dtype != np.float64:
                     raise ValueError(f"its {name} is {given.dtype} {given.shape}")
                 if not np.isfinite(given).all():
                     raise ValueError(f"its {name} is not finite")
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        except (KeyError, ValueError) as error:
             raise ValueError(unusable(file, str(error))) from None
         self.policy, self._mean = kept["policy"], kept["mean"]
         model.squares, model.products = kept["squares"], kept["products"]
