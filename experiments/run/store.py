@@ -40,19 +40,19 @@ def write_arrays(file: Path, arrays: Mapping[str, Any]) -> None:
     write_atomically(file, buffer.getvalue())
 
 
-def read_arrays(file: Path, limit: int = LARGEST_TRACE) -> dict[str, Any]:
-    """Read arrays by name from an .npz of at most `limit` bytes, packed and unpacked.
+def read_arrays(file: Path) -> dict[str, Any]:
+    """Read arrays by name from an .npz of at most `LARGEST_TRACE` bytes, packed and unpacked.
 
     Raises
     ------
     ValueError
         In one line that begins with the file's name, if it cannot be read.
     """
-    content = io.BytesIO(read_bytes(file, limit))
+    content = io.BytesIO(read_bytes(file, LARGEST_TRACE))
     try:
         with zipfile.ZipFile(content) as packed:
             size = sum(entry.file_size for entry in packed.infolist())
-        if size > limit:
+        if size > LARGEST_TRACE:
             raise ValueError(f"{size} bytes are too many")
         with np.load(content, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}

@@ -23,13 +23,14 @@ from experiments.jobs.job import (
     TRAINING_PATHS,
     VALIDATION_EPISODES,
     VALIDATION_PATHS,
+    VERSIONS,
     Listener,
     difference,
     episode_seed,
     load_paths,
-    locked,
 )
 from experiments.run.case import run_case
+from experiments.run.folder_lock import locked
 from experiments.run.suites import HELD_OUT, SIX
 from experiments.training import ALGORITHMS
 from experiments.training.loop import cases, make_trainer, path_names, train, validate
@@ -395,6 +396,42 @@ def test_one_process_trains_in_a_folder(tmp_path: Path) -> None:
     with locked(tmp_path), pytest.raises(ValueError, match="another process writes"):
         run(tiny("bc"), tmp_path)
     assert len(run(tiny("bc"), tmp_path)["lines"]) == 3
+
+
+def test_a_training_made_with_other_versions_is_not_gone_on_with(tmp_path: Path) -> None:
+    settings = tiny("bc")
+    run(settings, tmp_path)
+    own = json.loads((tmp_path / VERSIONS).read_text())
+    assert {"python", "machine", "numpy", "numba", "torch", "stable-baselines3"} <= set(own)
+    (tmp_path / VERSIONS).write_text(json.dumps({**own, "numpy": "1.0.0"}))
+    with pytest.raises(ValueError, match=f"made with numpy 1.0.0, here is {own['numpy']}: "):
+        run(settings, tmp_path)
+    # A package that was not there then could not compute anything; older folders have no versions.
+    (tmp_path / VERSIONS).write_text(json.dumps({"numpy": own["numpy"]}))
+    run(settings, tmp_path)
+    (tmp_path / VERSIONS).unlink()
+    run(settings, tmp_path)
+    assert json.loads((tmp_path / VERSIONS).read_text()) == own
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"lines": 3}, {"lines": [{"steps": 1}]}, {"trainer": {}}, {"trainer": None},
+        {"trainer": {"network": {"weight": 1}}}, {"lines": [{"steps": "few"}]},
+    ],
+)  # fmt: skip
+def test_a_checkpoint_that_does_not_fit_is_refused_in_one_line(
+    tmp_path: Path, change: dict[str, Any]
+) -> None:
+    settings = tiny("bc")
+    run(settings, tmp_path)
+    stored = checkpoint.read(tmp_path)
+    assert stored is not None
+    checkpoint.write(tmp_path, {**stored, **change})
+    with pytest.raises(ValueError, match=r"checkpoint\.pt cannot be read .*: remove it") as caught:
+        run(settings, tmp_path)
+    assert "\n" not in str(caught.value)
 
 
 def test_the_help_names_every_hyperparameter(capsys: pytest.CaptureFixture[str]) -> None:
