@@ -91,7 +91,9 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         `gymnasium.vector.AutoresetMode` or its value.
     threads
         Threads of a step, 1 by default; more are faster from about 1000 environments on. Results
-        do not depend on them.
+        do not depend on them. A process forked after a step with threads, such as a worker of
+        Gymnasium's `AsyncVectorEnv`, goes on with one and warns of it: OpenMP allows no threads
+        there. Workers started by "spawn" or "forkserver" (`context=`) keep them.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  declared so by gymnasium

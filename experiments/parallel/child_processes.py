@@ -23,6 +23,8 @@ from typing import Any
 
 from numba.core import event
 
+from experiments.run.case import in_words
+
 READY, FAILED, COMPILED = "ready", "failed", "compiled"
 DEATH_SIGNAL, TIMER_SLACK = 1, 29
 """prctl's PR_SET_PDEATHSIG and PR_SET_TIMERSLACK."""
@@ -62,8 +64,8 @@ def child_main(role: Role, connection: Connection, parent: int, arguments: tuple
     link = Link(connection)
     try:
         role(link, *arguments)
-    except Exception as error:  # noqa: BLE001  reported to the supervisor, which ends the run
-        link.report(FAILED, f"{type(error).__name__}: {' '.join(str(error).split())}")
+    except BaseException as error:  # noqa: BLE001  reported to the supervisor, which ends the run
+        link.report(FAILED, in_words(error))
         sys.exit(1)
 
 

@@ -22,6 +22,7 @@ from experiments.parallel.setup import (
     STALE_PERIODS,
     Setup,
 )
+from experiments.run.case import in_words
 from lpv_track_env.bicycle import VX, X, Y
 from lpv_track_env.estimation.observer import PathObserver
 from lpv_track_env.vehicle import VehicleParameters
@@ -154,8 +155,7 @@ class Controller:
             self._in_a_row += 1
             if self._in_a_row >= MAX_FAILURES:
                 raise RuntimeError(
-                    f"predict failed {MAX_FAILURES} times in a row, "
-                    f"last with {type(error).__name__}: {error}"
+                    f"predict failed {MAX_FAILURES} times in a row, last with {in_words(error)}"
                 ) from error
             self._brake(FAILED, steering_angle)
             return

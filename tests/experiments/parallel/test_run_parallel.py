@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -224,13 +224,29 @@ def fails(link: Link) -> None:
     raise OSError("no such\nthing")
 
 
-def test_a_child_tells_what_it_failed_of() -> None:
+def exits(link: Link) -> None:
+    sys.exit("enough")
+
+
+def fails_unreadably(link: Link) -> None:
+    raise faulty_agents.UnreadableError
+
+
+@pytest.mark.parametrize(
+    ("role", "told"),
+    [
+        (fails, "failed: OSError: no such thing"),
+        (exits, "failed: SystemExit: enough"),
+        (fails_unreadably, "failed: UnreadableError, whose message cannot be read"),
+    ],
+)
+def test_a_child_tells_what_it_failed_of(role: Callable[[Link], None], told: str) -> None:
     context = multiprocessing.get_context("spawn")
-    child = Child("estimator", context, fails, ())
+    child = Child("estimator", context, role, ())
     child.process.join(30.0)
     assert child.dead
-    assert child.reported("ready")
-    assert child.how_it_ended() == "failed: OSError: no such thing"
+    assert child.reported("ready") == (role is fails)
+    assert child.how_it_ended() == told
     child.end()
 
 
