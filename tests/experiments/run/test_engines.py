@@ -1,7 +1,11 @@
 """Engines: what runs where, and that neither a dead worker nor a stop loses or leaves anything."""
 
+import ctypes
 import multiprocessing
 import os
+import signal
+import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -54,6 +58,51 @@ def raise_one(spec: Spec) -> dict[str, Any]:
 def linger(spec: Spec) -> dict[str, Any]:
     time.sleep(0 if spec["seed"] == 0 else 120)
     return note(spec)
+
+
+def stick(spec: Spec) -> dict[str, Any]:
+    """Leave the process's number, and wait for ever in native code that holds the interpreter."""
+    Path(spec["env_settings"]["mark"]).write_text(str(os.getpid()))
+    ctypes.PyDLL(None).pause()
+    return note(spec)
+
+
+def stick_first(spec: Spec) -> dict[str, Any]:
+    return stick(spec) if spec["seed"] == 0 else note(spec)
+
+
+def other_process(run: str, *notes: str) -> "subprocess.Popen[str]":
+    """Another process that has just begun to run specs in a pool, in a session of its own."""
+    code = (
+        "import sys\n"
+        "from experiments.run.engines import local_pool\n"
+        f"from tests.experiments.run.test_engines import {run} as run, specs\n"
+        "print('begun', flush=True)\n"
+        "list(local_pool(specs(3, mark=sys.argv[1])[1:], 2, run=run))\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *notes], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True, start_new_session=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline() == "begun\n"
+    return process
+
+
+def runs(pid: int) -> bool:
+    """Return whether a process is there and no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def session(entry: Path) -> int:
+    """Session of a process."""
+    try:
+        return int(entry.joinpath("stat").read_text().rpartition(")")[2].split()[3])
+    except OSError:
+        return 0
 
 
 def workers_left(patience: float = 5.0) -> list[str]:
@@ -155,3 +204,62 @@ def test_more_workers_than_cases() -> None:
 def test_no_workers_are_refused(workers: int) -> None:
     with pytest.raises(ValueError, match=f"workers must be at least 1, not {workers}"):
         next(local_pool(specs(1), workers, run=note, failed=failed_case))
+
+
+@pytest.mark.parametrize("delay", [0.05, 0.5])
+def test_ctrl_c_while_workers_start_gives_one_traceback(delay: float) -> None:
+    process = other_process("linger", "none")
+    time.sleep(delay)
+    os.killpg(process.pid, signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert error.count("KeyboardInterrupt") == 1
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc to look into")
+def test_workers_in_native_code_end_with_a_killed_parent(tmp_path: Path) -> None:
+    mark = tmp_path / "pid"
+    process = other_process("stick", str(mark))
+    until = time.monotonic() + 60.0
+    while not (mark.exists() and mark.read_text()) and time.monotonic() < until:
+        time.sleep(0.05)
+    worker = int(mark.read_text())
+    assert runs(worker)
+    process.kill()
+    process.communicate()
+    until = time.monotonic() + 10.0
+    while runs(worker) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not runs(worker)
+
+
+@pytest.mark.skipif(not Path("/dev/shm").exists(), reason="there is no /dev/shm")  # noqa: S108
+def test_nothing_is_left_of_a_pool_that_is_killed_as_a_group(tmp_path: Path) -> None:
+    mark = tmp_path / "pid"
+    process = other_process("stick", str(mark))
+    until = time.monotonic() + 60.0
+    while not mark.exists() and time.monotonic() < until:
+        time.sleep(0.05)
+    # Semaphores would be there while the pool runs, and stay when all of it is killed at once.
+    held = [
+        line
+        for entry in Path("/proc").glob("[0-9]*")
+        if entry.joinpath("stat").exists() and session(entry) == process.pid
+        for line in entry.joinpath("maps").read_text().splitlines()
+        if "/dev/shm" in line  # noqa: S108
+    ]
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert held == []
+
+
+def test_a_run_over_its_limit_is_ended_and_no_other_suffers(tmp_path: Path) -> None:
+    mark = tmp_path / "pid"
+    began = time.monotonic()
+    cases = [*specs(1, mark=str(mark)), *specs(4)[1:]]
+    results = list(local_pool(cases, 2, run=stick_first, limit=2.0))
+    assert seeds(results) == [0, 1, 2, 3]
+    failed = {result["seed"]: result.get("error") for result in results}
+    assert failed == {0: "took longer than 2 s", 1: None, 2: None, 3: None}
+    assert not runs(int(mark.read_text()))
+    assert workers_left() == []
+    assert time.monotonic() - began < 60.0
