@@ -22,9 +22,11 @@ from agents.inputs import foreign, observation_rows, started_rows
 from lpv_track_env.conditions import Actuation
 from lpv_track_env.conditions.vehicle import controlled_stop
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
+from lpv_track_env.task import checked_period
 from lpv_track_env.validation import two_numbers
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
+from trajectories.arguments import instance_of, shortened
 
 Action = NDArray[np.float32]
 Memory = TypeVar("Memory")
@@ -67,6 +69,11 @@ class DrivingTask:
 
     `path` is for rules that derive settings from the whole path (the paper's choice of weights).
     While driving, an agent uses observations only.
+
+    Raises
+    ------
+    ValueError
+        For a field of another type, or an invalid period.
     """
 
     layout: ObservationLayout
@@ -75,6 +82,15 @@ class DrivingTask:
     path: ReferencePath
     actuation: Actuation = NO_DELAYS
     """Nominal delays and lags between a command and its effect, s."""
+
+    def __post_init__(self) -> None:
+        kinds = {
+            "layout": ObservationLayout, "vehicle": VehicleParameters, "path": ReferencePath,
+            "actuation": Actuation,
+        }  # fmt: skip
+        for name, kind in kinds.items():
+            instance_of(name, getattr(self, name), kind, f"of type {kind.__name__}")
+        object.__setattr__(self, "control_period", checked_period(self.control_period))
 
     @property
     def delayed(self) -> bool:
@@ -102,7 +118,8 @@ class DrivingTask:
             return cls(*(env.get_wrapper_attr(name) for name in names))
         except AttributeError as error:
             raise TypeError(
-                f"{type(env.unwrapped).__name__} is not a path tracking environment: {error}"
+                f"{type(getattr(env, 'unwrapped', env)).__name__} is not a path tracking "
+                f"environment: {shortened(error)}"
             ) from None
 
 

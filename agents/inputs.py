@@ -40,6 +40,8 @@ CURVATURE_BOUND, SPEED_BOUND = (float(np.float32(bound)) for _, _, bound in PREV
 @compiled_internal
 def limited(value: Any, bound: Any) -> Any:
     """Return a value saturated at -bound and bound, unless it is not finite."""
+    if math.isnan(value):  # of any kind: the signalling ones would warn later on
+        return math.nan
     return math.copysign(bound, value) if bound < abs(value) < math.inf else value
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import CHECKPOINTS, Action, Agent, DrivingTask
-from trajectories.arguments import shown
+from trajectories.arguments import flag, instance_of, shortened, shown
 from trajectories.naming import suggestion
 
 REGISTRY: dict[str, str] = {
@@ -55,7 +55,7 @@ def agent_class(name: str) -> Callable[..., Any]:
     ValueError
         For an unknown name, listing the known ones and the nearest; or for an unusable file.
     """
-    if name.endswith(POLICY_FILES):
+    if instance_of("agent", name, str, "a name").endswith(POLICY_FILES):
         from agents.learned.agent import agent_of_file
 
         return agent_of_file(name)
@@ -71,8 +71,9 @@ def agent_class(name: str) -> Callable[..., Any]:
             found: Callable[..., Any] = getattr(_module_of(Path(module).resolve()), attribute)
         else:
             found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, OSError, SyntaxError) as error:
-        raise ValueError(f"agent {shown(name)} cannot be loaded: {error}") from error
+    except Exception as error:  # a user's file may raise anything
+        reason = shortened(error) or type(error).__name__
+        raise ValueError(f"agent {shown(name)} cannot be loaded: {reason}") from error
     return found
 
 
@@ -176,6 +177,8 @@ def make(
     """
     cls = agent_class(name)
     check_settings(name, settings)
+    if delay_compensation is not None:
+        delay_compensation = flag("delay_compensation", delay_compensation)
     compensates = getattr(cls, "compensates_delays", False)
     if compensates:
         settings["delay_compensation"] = delay_compensation
@@ -183,7 +186,7 @@ def make(
         task = DrivingTask.of(env)
         agent: Agent = cls(task, **settings)
     except TypeError as error:
-        raise ValueError(f"agent {shown(name)}: {error}") from error
+        raise ValueError(f"agent {shown(name)}: {shortened(error)}") from error
     wanted = task.delayed if delay_compensation is None else delay_compensation
     if wanted and not compensates:
         from agents.delay import DelayCompensated

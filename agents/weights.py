@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trajectories import CurvatureBands, ReferencePath
-from trajectories.arguments import shortened, shown
+from trajectories.arguments import Number, check_fields, instance_of, numbers, shortened, shown
+from trajectories.arguments import array as numbers_of
 from trajectories.fileio import read_json, write_atomically
 from trajectories.naming import choose
 
@@ -46,11 +47,7 @@ class TrackingWeights:
 
     def __post_init__(self) -> None:
         for name, size in (("Q", 4), ("S", 4), ("R", 2)):
-            values = tuple(float(value) for value in getattr(self, name))
-            if len(values) != size:
-                raise ValueError(f"{name} needs {size} weights, not {len(values)}")
-            if not all(math.isfinite(value) and value >= 0.0 for value in values):
-                raise ValueError(f"{name} must be finite and not negative, not {values}")
+            values = numbers(name, getattr(self, name), Number(0.0), size)
             object.__setattr__(self, name, values)
 
     def as_array(self) -> Array:
@@ -60,7 +57,7 @@ class TrackingWeights:
     @classmethod
     def from_array(cls, values: ArrayLike) -> "TrackingWeights":
         """Make weights of a vector (10,): the inverse of `as_array`."""
-        array = np.asarray(values, dtype=np.float64)
+        array = numbers_of("weights", values)
         if array.shape != (10,):
             raise ValueError(f"10 weights are needed, not shape {array.shape}")
         flat = array.tolist()
@@ -103,6 +100,14 @@ class WeightSchedule:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        instance_of("bands", self.bands, CurvatureBands, "CurvatureBands")
+        instance_of("weights", self.weights, tuple, "a tuple of TrackingWeights")
+        for one in self.weights:
+            instance_of("weights", one, TrackingWeights, "a tuple of TrackingWeights")
+        instance_of("provenance", self.provenance, Mapping, "a mapping")
+        check_fields(self, {"blend": Number()})
+        if self.slew is not None:
+            check_fields(self, {"slew": Number(0.0, math.inf, "1/s", above=True)})
         if len(self.weights) != len(self.bands):
             raise ValueError(f"{len(self.bands)} bands need as many sets, not {len(self.weights)}")
         edges = np.array(self.bands.thresholds)
@@ -111,8 +116,6 @@ class WeightSchedule:
             or (edges[1:] * (1.0 - self.blend) < edges[:-1] * (1.0 + self.blend)).any()
         ):
             raise ValueError(f"blend {self.blend} must be in [0, 1) and its zones must not overlap")
-        if self.slew is not None and not self.slew > 0.0:
-            raise ValueError(f"slew must be positive, not {self.slew}")
 
     def for_path(self, path: ReferencePath) -> TrackingWeights:
         """Return the set for the path's sharpest curvature, the rule of the paper."""

@@ -5,20 +5,24 @@ it. Whatever is given, be it text, a nested list, or an object whose own methods
 number within the rule or refused by a message that shows it, shortened.
 """
 
+import functools
+import inspect
 import math
 import operator
 import reprlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
 from types import UnionType
-from typing import Any
+from typing import Any, ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
 
 LARGEST = sys.float_info.max
+
+P = ParamSpec("P")
 
 
 class _Short(reprlib.Repr):
@@ -218,3 +222,27 @@ def check_fields(instance: object, rules: Mapping[str, Number | Whole], prefix: 
     """
     for name, rule in rules.items():
         object.__setattr__(instance, name, rule.of(f"{prefix}{name}", getattr(instance, name)))
+
+
+def checks_arguments(**rules: Number | Whole) -> Callable[[Callable[P, None]], Callable[P, None]]:
+    """Decorate an `__init__`: the arguments named here become what their rules make of them.
+
+    Raises
+    ------
+    ValueError
+        Naming the first argument that does not keep to its rule.
+    """
+
+    def decorate(initialise: Callable[P, None]) -> Callable[P, None]:
+        signature = inspect.signature(initialise)
+
+        @functools.wraps(initialise)
+        def checked(*arguments: P.args, **named: P.kwargs) -> None:
+            given = signature.bind(*arguments, **named)
+            for name in rules.keys() & given.arguments.keys():
+                given.arguments[name] = rules[name].of(name, given.arguments[name])
+            initialise(*given.args, **given.kwargs)
+
+        return checked
+
+    return decorate

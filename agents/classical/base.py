@@ -1,5 +1,6 @@
 """Base classes of the classical agents: speed control, and the nominal motion along the path."""
 
+import math
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
@@ -19,11 +20,20 @@ from agents.reference import (
 )
 from lpv_track_env import bicycle
 from lpv_track_env.observation import TrackingObservation
+from trajectories.arguments import Number
 
 PROPORTIONAL_GAIN = 1.5
 """kp, 1/s; decay rate of a speed error."""
 INTEGRAL_GAIN = 0.4
 """ki, 1/s^2; kp^2/4 is critically damped."""
+
+# Rules of settings: none lets the arithmetic overflow or divide by zero.
+GAIN = Number(-1e6, 1e6)
+DURATION = Number(0.0, 1e6, "s")
+LOOKAHEAD = Number(1e-3, 1e6, "wheelbases")
+WINDOW = Number(0.0, 1e6, "m")
+ANGLE = Number(0.0, math.pi, "rad")
+SHARE = Number(1e-3, 1e3)
 
 
 @dataclass

@@ -9,9 +9,20 @@ import math
 from dataclasses import dataclass
 
 from agents.base import DrivingTask
-from agents.classical.base import ClassicalAgent, MotionMemory, NominalMotionAgent, SpeedMemory
+from agents.classical.base import (
+    DURATION,
+    GAIN,
+    LOOKAHEAD,
+    SHARE,
+    WINDOW,
+    ClassicalAgent,
+    MotionMemory,
+    NominalMotionAgent,
+    SpeedMemory,
+)
 from agents.reference import LocalReference, mean_curvature, point_at, steady_turn
 from lpv_track_env.observation import TrackingObservation
+from trajectories.arguments import Number, checks_arguments
 
 
 @dataclass
@@ -56,6 +67,14 @@ class Stanley(NominalMotionAgent[StanleyMemory]):
         Curvature with which undrivable corners are rounded, as a share of that at full lock.
     """
 
+    @checks_arguments(
+        gain=GAIN,
+        softening_speed=Number(0.0, 1e6, "m/s", above=True),
+        yaw_damping=GAIN,
+        steering_damping=GAIN,
+        curvature_window=WINDOW,
+        early_turn_share=SHARE,
+    )
     def __init__(
         self,
         task: DrivingTask,
@@ -123,6 +142,11 @@ class PurePursuit(ClassicalAgent[SpeedMemory]):
         Distance ahead of the foot point over which the curvature for the rear slip is averaged, m.
     """
 
+    @checks_arguments(
+        lookahead_time=DURATION,
+        lookahead_wheelbases=LOOKAHEAD,
+        curvature_window=WINDOW,
+    )
     def __init__(
         self,
         task: DrivingTask,

@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
 from agents.base import DrivingTask
-from agents.classical.base import ClassicalAgent, SpeedMemory
+from agents.classical.base import ANGLE, WINDOW, ClassicalAgent, SpeedMemory
 from agents.reference import LocalReference, mean_curvature, steady_turn
 from lpv_track_env import lpv
 from lpv_track_env.bicycle import VY, YAW_RATE
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.vehicle import VehicleParameters
+from trajectories.arguments import Number, checks_arguments
 
 Array = NDArray[np.float64]
 
@@ -130,6 +131,13 @@ class LpvLqr(ClassicalAgent[SpeedMemory]):
         Distance ahead of the foot point over which the steady turn's curvature is averaged, m.
     """
 
+    @checks_arguments(
+        lateral_error_weight=Number(1e-6, 1e6),
+        lateral_rate_weight=Number(0.0, 1e6),
+        steering_rate_weight=Number(1e-6, 1e6),
+        approach_angle=ANGLE,
+        curvature_window=WINDOW,
+    )
     def __init__(
         self,
         task: DrivingTask,
@@ -143,10 +151,13 @@ class LpvLqr(ClassicalAgent[SpeedMemory]):
     ) -> None:
         super().__init__(task, curvature_window)
         self.approach_angle = approach_angle
+        fastest = task.vehicle.speed_range[1]
+        # At least two speeds, and not so many that their gains take minutes.
+        speed_step = Number(0.05, 0.5 * fastest, "m/s").of("speed_step", speed_step)
         self.slowest = speed_step
         layout, period = task.layout, task.control_period
         self.count = max(round(layout.preview_steps * layout.preview_period / period), 1)
-        forward = speed_step * np.arange(1, round(task.vehicle.speed_range[1] / speed_step) + 1)
+        forward = speed_step * np.arange(1, round(fastest / speed_step) + 1)
         self.speeds = np.concatenate([-forward[forward <= 5.0][::-1], forward])
         """Speed grid, (m,) m/s."""
         rows = []

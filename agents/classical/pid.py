@@ -4,9 +4,19 @@ import math
 from dataclasses import dataclass
 
 from agents.base import DrivingTask
-from agents.classical.base import MotionMemory, NominalMotionAgent
+from agents.classical.base import (
+    ANGLE,
+    DURATION,
+    GAIN,
+    LOOKAHEAD,
+    SHARE,
+    WINDOW,
+    MotionMemory,
+    NominalMotionAgent,
+)
 from agents.reference import LocalReference
 from lpv_track_env.observation import TrackingObservation
+from trajectories.arguments import Number, checks_arguments
 
 
 @dataclass
@@ -59,6 +69,17 @@ class Pid(NominalMotionAgent[PidMemory]):
         Curvature with which undrivable corners are rounded, as a share of that at full lock.
     """
 
+    @checks_arguments(
+        lookahead_time=DURATION,
+        lookahead_wheelbases=LOOKAHEAD,
+        damping=GAIN,
+        integral_time=Number(1e-3, math.inf, "s"),
+        derivative_time=DURATION,
+        filter_time=DURATION,
+        approach_angle=ANGLE,
+        curvature_window=WINDOW,
+        early_turn_share=SHARE,
+    )
     def __init__(
         self,
         task: DrivingTask,

@@ -21,7 +21,7 @@ import numpy as np
 import safetensors
 from numpy.typing import NDArray
 
-from trajectories.arguments import shown
+from trajectories.arguments import shortened, shown
 from trajectories.fileio import checked, parse_json, read_bytes
 
 MOST_WEIGHTS = 64 * 2**20
@@ -89,10 +89,11 @@ def check_suffix(kind: Kind, file: Path) -> None:
     """Check that a file is a NAME.json; the error says which file to give instead."""
     if file.suffix == ".json":
         return
+    name = shortened(file)
     if file.suffix == ".safetensors":
         spec = file.with_name(f"{DIGEST.sub('', file.stem)}.json")
-        raise ValueError(f"{file} holds a {kind.noun}'s weights alone: give its spec, {spec}")
-    raise ValueError(f"{file} is no {kind.noun} file: give the NAME.json that it was written to")
+        raise ValueError(f"{name} holds a {kind.noun}'s weights alone: give its spec, {spec}")
+    raise ValueError(f"{name} is no {kind.noun} file: give the NAME.json that it was written to")
 
 
 def read_spec(kind: Kind, file: Path) -> Spec:

@@ -25,7 +25,7 @@ from agents.learned.files import (
 from agents.learned.storage import write_files
 from lpv_track_env.observation import SCALARS, ObservationLayout
 from lpv_track_env.task import checked_period
-from trajectories.arguments import shortened, shown
+from trajectories.arguments import instance_of, shortened, shown
 from trajectories.naming import choose
 
 Weights = NDArray[np.float32]
@@ -118,6 +118,7 @@ class Policy:
 
     def __post_init__(self) -> None:
         checked_name(self.algorithm)
+        instance_of("layout", self.layout, ObservationLayout, "an ObservationLayout")
         choose("activation", self.activation, ACTIVATIONS)
         choose("squash", self.squash, SQUASHES)
         choose("origin", self.origin, ORIGINS)
@@ -200,7 +201,7 @@ def read(file: str | Path) -> Policy:
         In one line that names the file and what to do: for files that are missing, torn, changed,
         too large, of another format version, or made for other entries of the observation.
     """
-    file = Path(file)
+    file = Path(instance_of("policy", file, str | Path, "the path of a NAME.json"))
     if file.suffix == ".zip":
         raise ValueError(
             f"{file} is a model of Stable-Baselines3, which runs code when it is loaded: if you "
@@ -279,7 +280,7 @@ def checked_number(name: str, value: Any) -> float:
 def _array(name: str, value: ArrayLike, dtype: type[np.floating[Any]]) -> NDArray[Any]:
     try:
         given = np.asarray(value)
-    except (TypeError, ValueError) as error:
+    except Exception as error:  # conversions of a user's object may raise anything
         raise ValueError(f"{name} is not an array of numbers: {shortened(error)}") from error
     if given.dtype.kind not in "fiu":
         raise ValueError(f"{name} is not an array of numbers, but of {given.dtype}")
@@ -305,6 +306,7 @@ def checked_layers(
 
     `meaning` says in the message what the outputs are for.
     """
+    instance_of("layers", layers, list | tuple, "a tuple of weights and biases")
     if not 1 <= len(layers) <= MOST_LAYERS:
         raise ValueError(f"layers must be 1 to {MOST_LAYERS}, not {len(layers)}")
     checked: list[Layer] = []

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from agents.nmpc.problem import INPUTS, OUTPUTS, SOFT, STATES, NmpcProblem, Solution, Status
 from lpv_track_env import lpv
+from trajectories.arguments import Number, checks_arguments
 
 Array = NDArray[np.float64]
 
@@ -49,6 +50,7 @@ WARM_OPTIONS: dict[str, Any] = {
     "mu_strategy": "adaptive",  # 5 iterations a solve where the monotone strategy takes 13
 }
 FATROP_ITERATIONS = 200
+TOLERANCE = Number(0.0, 1.0, above=True)
 RELAXATION = 1e-8
 """fatrop relaxes every bound b by RELAXATION max(1, |b|), which none of its options turns off."""
 
@@ -258,6 +260,7 @@ class IpoptSolver(_NlpSolver):
     SLACK: ClassVar[list[int]] = [2, 3, 4]
     WARM: ClassVar[dict[str, str]] = {"x0": "x", "lam_x0": "lam_x", "lam_g0": "lam_g"}
 
+    @checks_arguments(tolerance=TOLERANCE, max_seconds=Number(0.0, 1e6, "s", above=True))
     def __init__(
         self, problem: NmpcProblem, *, tolerance: float = 1e-6, max_seconds: float = 20.0
     ) -> None:
@@ -365,6 +368,7 @@ class FatropSolver(_NlpSolver):
     INPUT = (slice(0, INPUTS), slice(STATE.stop, STATE.stop + INPUTS))
     WARM: ClassVar[dict[str, str]] = {"x0": "x"}
 
+    @checks_arguments(tolerance=TOLERANCE)
     def __init__(self, problem: NmpcProblem, *, tolerance: float = 1e-6) -> None:
         if not ca.has_nlpsol("fatrop"):
             raise ValueError(

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from agents.nmpc import layout as L
 from agents.nmpc import linearisation, qp, rti
 from agents.nmpc.linearisation import Linearisation
-from agents.nmpc.problem import STATES, NmpcProblem, Solution, Status
+from agents.nmpc.problem import INPUTS, STATES, NmpcProblem, Solution, Status
 from lpv_track_env.bicycle import compiled_field, compiled_inverse_speed
+from trajectories.arguments import Number, Whole, checks_arguments, numbers
 from trajectories.compilation import compiled
 
 Array = NDArray[np.float64]
@@ -175,6 +176,10 @@ class RtiSolver:
         For no iterations, a negative damping or a tolerance that is not positive.
     """
 
+    @checks_arguments(
+        iterations=Whole(1, 10_000),
+        tolerance=Number(0.0, 1.0, above=True),
+    )
     def __init__(
         self,
         problem: NmpcProblem,
@@ -183,14 +188,8 @@ class RtiSolver:
         damping: tuple[float, float] = DAMPING,
         tolerance: float = 1e-12,
     ) -> None:
-        if iterations < 1:
-            raise ValueError(f"iterations must be at least 1, not {iterations}")
-        if not all(value >= 0.0 for value in damping):
-            raise ValueError(f"damping must not be negative, not {damping}")
-        if not tolerance > 0.0:
-            raise ValueError(f"tolerance must be positive, not {tolerance}")
         self.problem = problem
-        self.damping = (float(damping[0]), float(damping[1]))
+        self.damping = numbers("damping", damping, Number(0.0, 1e9), INPUTS)
         car, order = problem.vehicle, np.array(L.SLACK_OF)
         first = problem.period if problem.first_period is None else problem.first_period
         first_step, last_step = problem.input_steps[0], problem.input_steps[-1]

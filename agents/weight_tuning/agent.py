@@ -1,5 +1,6 @@
 """`lpv-nmpc-tuned`: the NMPC with weights that are chosen while it drives."""
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -27,6 +28,7 @@ from agents.weight_tuning.loop_memory import LoopMemory, LoopRow
 from agents.weight_tuning.policy import WeightPolicy, load
 from agents.weights import TrackingWeights, WeightSchedule, weights_from
 from lpv_track_env.validation import forwards_arguments
+from trajectories.arguments import flag, shown
 from trajectories.compilation import entry_point
 
 Weights = WeightPolicy | WeightSchedule | TrackingWeights
@@ -92,7 +94,9 @@ class TunedNmpc:
             )  # fmt: skip
         fixed = None if isinstance(self.weights, WeightPolicy) else self.weights
         self.nmpc = RtiNmpc(task, weights=fixed, **settings)
-        delayed = task.delayed if delay_compensation is None else delay_compensation
+        delayed = task.delayed
+        if delay_compensation is not None:
+            delayed = flag("delay_compensation", delay_compensation)
         self.future = NearFuture(task, task.actuation, settings["model"]) if delayed else None
         self._decider = (
             None if policy is None else Decider(policy.choice, policy.layers, task.control_period)
@@ -217,9 +221,9 @@ def _loaded(weights: str | Path | Mapping[str, Any] | Weights) -> Weights:
             f"first two, not {type(weights).__name__}"
         )
     file = SHIPPED.get(str(weights), Path(weights))
-    if not file.is_file():
+    if not os.path.isfile(file):  # noqa: PTH113  Path.is_file raises for names that no file has
         raise ValueError(
-            f"weights {weights}: no such file; give weights= the .json of a schedule or of a "
-            f"policy of weights, or as shipped: {', '.join(SHIPPED)}"
+            f"weights {shown(str(weights))}: no such file; give weights= the .json of a schedule "
+            f"or of a policy of weights, or as shipped: {', '.join(SHIPPED)}"
         )
     return load(file)

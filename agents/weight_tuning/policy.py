@@ -39,7 +39,7 @@ from agents.weights import FORMAT as SCHEDULE
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.task import checked_period
-from trajectories.arguments import shortened, shown
+from trajectories.arguments import instance_of, shortened, shown
 
 WEIGHT_POLICY = Kind(
     format="lpv-track-weights/1",
@@ -94,6 +94,8 @@ class WeightPolicy:
 
     def __post_init__(self) -> None:
         checked_name(self.algorithm)
+        instance_of("choice", self.choice, WeightChoice, "a WeightChoice")
+        instance_of("layout", self.layout, ObservationLayout, "an ObservationLayout")
         inputs, outputs = size(len(self.choice.bands)), self.choice.entries
         layers = checked_layers(self.layers, inputs, outputs, "as the choice has entries")
         base = WeightSchedule.from_dict(plain_json("choice.base", self.choice.schedule.as_dict()))

@@ -236,6 +236,89 @@ def _nmpc(settings: Any) -> None:
     _act(agents.make("lpv-nmpc", _env(), **given))
 
 
+def _task() -> Any:
+    from agents.base import DrivingTask
+
+    return DrivingTask.of(_env())
+
+
+def _problem() -> Any:
+    from agents.nmpc.problem import NmpcProblem
+
+    return NmpcProblem(_vehicle(), horizon=5)
+
+
+def _policy() -> dict[str, Callable[[], Any]]:
+    import dataclasses
+
+    from agents.base import CHECKPOINTS
+    from agents.learned.policy import read
+
+    made = read(CHECKPOINTS / "bc.json")
+    return {field.name: _some(getattr(made, field.name)) for field in dataclasses.fields(made)}
+
+
+def _weight_policy() -> dict[str, Callable[[], Any]]:
+    import dataclasses
+
+    from agents.base import CHECKPOINTS
+    from agents.weight_tuning.policy import read
+
+    made = read(CHECKPOINTS / "lpv-nmpc-tuned-paired.json")
+    return {field.name: _some(getattr(made, field.name)) for field in dataclasses.fields(made)}
+
+
+def _bands() -> Any:
+    from trajectories import CurvatureBands
+
+    return CurvatureBands()
+
+
+def _sets() -> Any:
+    from agents.weights import TrackingWeights
+
+    return (TrackingWeights(),) * len(_bands())
+
+
+def _solve(solver: Any) -> None:
+    """Solve once; what is found must be finite."""
+    solution, _ = solver.solve(
+        np.array([8.0, 0, 0, 0, 0, 0]), np.zeros(2), np.tile([8.0, 0, 0, 0], (6, 1)), np.ones(10)
+    )
+    if solution.inputs is not None and not np.isfinite(solution.inputs).all():
+        raise ArithmeticError("not finite")
+
+
+def _predict(agent: str, observation: Any, state: Any, episode_start: Any) -> None:
+    """Call `predict` of an agent; the action must be finite."""
+    import agents
+
+    made = agents.make(agent, _env())
+    action, _ = made.predict(observation, state, episode_start)
+    if not np.isfinite(action).all():
+        raise ArithmeticError("not finite")
+
+
+def _observed() -> Any:
+    return _env().reset(seed=0)[0]
+
+
+def _predict_stanley(observation: Any, state: Any = None, episode_start: Any = None) -> None:
+    _predict("stanley", observation, state, episode_start)
+
+
+def _predict_nmpc(observation: Any, state: Any = None, episode_start: Any = None) -> None:
+    _predict("lpv-nmpc", observation, state, episode_start)
+
+
+def _predict_tuned(observation: Any, state: Any = None, episode_start: Any = None) -> None:
+    _predict("lpv-nmpc-tuned", observation, state, episode_start)
+
+
+def _predict_ppo(observation: Any, state: Any = None, episode_start: Any = None) -> None:
+    _predict("ppo", observation, state, episode_start)
+
+
 U_TURN = {"trajectory": _some("u-turn")}
 TARGETS: tuple[Target, ...] = (
     Target("lpv_track_env.env:PathTrackingEnv", U_TURN, _drive),
@@ -273,6 +356,32 @@ TARGETS: tuple[Target, ...] = (
     Target(f"{__name__}:_computing_time", {}),
     Target(f"{__name__}:_agent", {}),
     Target("agents.nmpc.base:NmpcSettings", {}, _nmpc),
+    Target("agents.base:DrivingTask", {
+        name: (lambda name=name: getattr(_task(), name))  # type: ignore[misc]
+        for name in ("layout", "vehicle", "control_period", "path")
+    }),
+    *(
+        Target(f"agents.{name}", {"task": _task}, _act)
+        for name in (
+            "classical.geometric:Stanley", "classical.geometric:PurePursuit", "classical.pid:Pid",
+            "classical.lqr:LpvLqr", "nmpc.rti_agent:RtiNmpc", "nmpc.ipopt_agent:IpoptNmpc",
+            "nmpc.frozen:FrozenLpvMpc", "weight_tuning.agent:TunedNmpc", "learned.agent:Bc",
+        )
+    ),
+    Target("agents.nmpc.problem:NmpcProblem", {"vehicle": _vehicle}),
+    Target("agents.nmpc.rti_solver:RtiSolver", {"problem": _problem}, _solve),
+    Target("agents.learned.policy:Policy", _policy()),
+    Target("agents.learned.policy:read", {}),
+    Target("agents.weight_tuning.policy:WeightPolicy", _weight_policy()),
+    Target("agents.weight_tuning.policy:load", {}),
+    Target("agents.weights:WeightSchedule", {
+        "bands": _bands, "weights": _sets,
+    }),
+    Target("agents.weights:weights_from", {}),
+    *(
+        Target(f"{__name__}:_predict_{name}", {"observation": _observed})
+        for name in ("stanley", "nmpc", "tuned", "ppo")
+    ),
 )  # fmt: skip
 
 

@@ -240,7 +240,7 @@ def test_bad_settings_are_refused() -> None:
             agents.make(name, env, horizon=30)
         with pytest.raises(ValueError, match="selection"):
             agents.make(name, env, selection="psychic")
-    with pytest.raises(ValueError, match="damping must not be negative"):
+    with pytest.raises(ValueError, match=r"damping\[0\] must be >= 0 and at most 1e\+09"):
         agents.make("lpv-nmpc", env, damping=(-1.0, 0.0))
     with pytest.raises(ValueError, match="tolerance must be positive"):
         agents.make("lpv-nmpc", env, tolerance=0.0)

@@ -260,11 +260,11 @@ def test_no_weight_on_anything_is_solved() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"iterations": 0}, "iterations must be at least 1, not 0"),
-        ({"damping": (-0.1, 0.0)}, r"damping must not be negative, not \(-0.1, 0.0\)"),
-        ({"damping": (0.0, float("nan"))}, "damping must not be negative"),
-        ({"damping": (float("nan"), 0.0)}, "damping must not be negative"),
-        ({"tolerance": 0.0}, "tolerance must be positive, not 0.0"),
+        ({"iterations": 0}, "iterations must be a whole number from 1 to 10,000, not 0"),
+        ({"damping": (-0.1, 0.0)}, r"damping\[0\] must be >= 0 and at most 1e\+09, not -0.1"),
+        ({"damping": (0.0, float("nan"))}, r"damping\[1\] must be >= 0"),
+        ({"damping": (float("nan"), 0.0)}, r"damping\[0\] must be >= 0"),
+        ({"tolerance": 0.0}, "tolerance must be positive and at most 1, not 0.0"),
         ({"tolerance": float("nan")}, "tolerance must be positive"),
     ],
 )

@@ -117,7 +117,8 @@ def test_weights_that_cannot_be_used_are_refused_before_a_drive(
     bad = 'weights={"Q":[1,1,20],"S":[5,5,100,100],"R":[0.01,1]}'
     out = tmp_path / "out"
     assert main(["benchmark", "--agents", "lpv-nmpc", "--agent-set", bad, "--out", str(out)]) == 2
-    assert capsys.readouterr().err == "lpv-track: weights: Q needs 4 weights, not 3\n"
+    said = "lpv-track: weights: Q must be 4 numbers, each >= 0 and finite, not [1, 1, 20]\n"
+    assert capsys.readouterr().err == said
     assert not out.exists()
 
 
