@@ -182,7 +182,7 @@ def test_blending_ends_at_the_bands_own_sets_and_meets_half_way() -> None:
 @pytest.mark.parametrize("blend", [0.43, 0.99, 1.0, -0.1, math.nan])
 def test_overlapping_zones_are_refused(blend: float) -> None:
     # Around 0.02 and 0.05 they touch at 3/7.
-    with pytest.raises(ValueError, match="zones must not overlap"):
+    with pytest.raises(ValueError, match="blend .*must (not overlap|be a finite number)"):
         schedule(blend)
     schedule(0.42)
 
@@ -260,7 +260,7 @@ def test_files_from_before_the_slew_limit_are_read(tmp_path: Path) -> None:
     ("place", "value", "reason"),
     [
         (("format",), "weight-schedule/3", "format is 'weight-schedule/3'"),
-        (("slew",), 0.0, "slew must be positive, not 0.0"),
+        (("slew",), 0.0, "slew must be positive 1/s, not 0.0"),
         (("slew",), "fast", "could not convert"),
         (("weights", 0, "Q", 2), -1.0, "Q[2] must be >= 0 and finite"),
         (("weights", 1, "S"), [1.0], "S must be 4 numbers"),
@@ -388,9 +388,9 @@ def test_weights_are_taken_as_they_are_from_a_file_or_typed(tmp_path: Path) -> N
         (7, "weights must be weights, a schedule or its file, not int"),
         ({"P": [1]}, "unknown matrix of weights 'P'; known: Q, S, R"),
         ({"Q": [1, 2]}, "Q must be 4 numbers"),
-        ({"Q": 3}, "not iterable"),
+        ({"Q": 3}, "Q must be 4 numbers, each >= 0 and finite, not 3"),
         ({"Q": ["a", 1, 1, 1]}, r"Q\[0\] must be >= 0 and finite, not 'a'"),
-        ({"R": [0.1, -1]}, "R must be finite and not negative"),
+        ({"R": [0.1, -1]}, r"R\[1\] must be >= 0 and finite, not -1"),
         ({"weights": [{}]}, "4 bands need as many sets, not 1"),
         ({"weights": 3}, "not iterable"),
         ({"weights": [], "bands": 7}, "not a mapping"),
