@@ -182,7 +182,7 @@ def test_blending_ends_at_the_bands_own_sets_and_meets_half_way() -> None:
 @pytest.mark.parametrize("blend", [0.43, 0.99, 1.0, -0.1, math.nan])
 def test_overlapping_zones_are_refused(blend: float) -> None:
     # Around 0.02 and 0.05 they touch at 3/7.
-    with pytest.raises(ValueError, match="blend .*must (not overlap|be a finite number)"):
+    with pytest.raises(ValueError, match=r"blend .*must (not overlap|be a finite number)"):
         schedule(blend)
     schedule(0.42)
 
