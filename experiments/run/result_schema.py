@@ -4,6 +4,7 @@ The same check holds for what a case leaves and for what anybody may have writte
 `cases.jsonl`: no result is stored that cannot be read.
 """
 
+import json
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -24,8 +25,8 @@ Name = Annotated[str, Meta(max_length=1000)]
 Id = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9_-]{1,64}\Z")]
 """An id is part of a file's name."""
 Settings = dict[str, Any] | None
-CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
-"""Characters that a terminal takes for commands, and that HTML forbids."""
+CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
+"""Characters that a terminal takes for commands and HTML forbids, and halves of characters."""
 
 
 class Solver(TypedDict, total=False):
@@ -119,12 +120,12 @@ def read_case(line: bytes, name: str) -> Case:
     ------
     ValueError
         In one line that begins with `name`, if it is not JSON, does not fit the schema, or holds
-        control characters.
+        characters that cannot be printed.
     """
     case: Case = parse_json(line, name)
-    checked(case, Stored, name)
     if any(CONTROL.search(text) for text in _texts(case)):
-        raise ValueError(f"{name}: holds control characters")
+        raise ValueError(f"{name}: holds characters that cannot be printed")
+    checked(case, Stored, name)
     return case
 
 
@@ -164,7 +165,7 @@ def as_stored(result: Mapping[str, Any]) -> Case:
         In one line that names the entry, if it holds anything else.
     """
     line = {key: plain(value, key) for key, value in result.items() if key != "trace"}
-    checked(line, Stored, "the result")
+    line = read_case(json.dumps(line).encode(), "the result")
     if "trace" not in result:
         return line
     trace = {name: np.asarray(values, float) for name, values in result["trace"].items()}

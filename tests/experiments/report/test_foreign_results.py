@@ -33,6 +33,7 @@ VALUES: dict[str, Any] = {
     "null": None, "whole": 5, "negative": -1, "real": 1.5, "text": "text", "list": [], "object": {},
     "mixed": [1, "a"], "nested": {"a": {"b": [1]}}, "true": True, "digits": 10**400, "huge": 1e308,
     "long": "x" * 200_000, "control": "\x1b[31m\x00", "html": HOSTILE,
+    "half": "\ud800",
 }  # fmt: skip
 KEYS = [
     *((key,) for key in BASE[1]),

@@ -85,15 +85,33 @@ def test_a_limit_that_is_none_is_refused(tmp_path: Path, limit: float) -> None:
         swept(tmp_path, ["Rolls"], limit=limit)
 
 
-def test_a_path_whose_warnings_are_no_list_ends_no_sweep(tmp_path: Path) -> None:
+def test_a_path_whose_warnings_are_no_list_is_refused_at_the_start(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "own.csv"
     files.write(load("u-turn"), file)
     text = file.read_text()
     file.write_text(text.replace("\n", "\n# warnings: 5\n", 1))
     specs = [{"agent": "stanley", "trajectory": name} for name in (str(file), "u-turn")]
     console = Console(file=io.StringIO())
-    store = run_benchmark(specs, tmp_path / "out", workers=1, settings={}, console=console)
-    assert [case["status"] for case in store.cases()] == ["failed", "ok"]
+    with pytest.raises(ValueError, match=r"own\.csv: .*warnings"):
+        run_benchmark(specs, tmp_path / "out", workers=1, settings={}, console=console)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"a": 10**30}, {"a": "\x1b[2J"}, {"a": "\ud800"}, {"a": float("nan")}]
+)
+def test_a_case_that_no_folder_could_give_back_is_refused_at_the_start(
+    tmp_path: Path, settings: dict[str, Any]
+) -> None:
+    console = Console(file=io.StringIO())
+    own = tmp_path / "own.py"
+    own.write_text("class Own:\n    def __init__(self, task, own=None): ...\n")
+    first = {"agent": f"{own}:Own", "trajectory": "u-turn"}
+    specs = [first, {**first, "agent_settings": {"own": settings}}]
+    with pytest.raises(ValueError, match=r"^(the result: |agent_settings\.own\.a is nan)"):
+        run_benchmark(specs, tmp_path / "out", workers=1, settings={}, console=console)
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_json_does_not_hold_is_named() -> None:
