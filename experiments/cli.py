@@ -37,9 +37,9 @@ COMMANDS = {
 """Commands and their summaries; a command's module is `experiments.commands.NAME`."""
 
 
-LONGEST_LINE = 350
-"""Characters of the longest error message."""
-LONGEST_WORD = 60
+LONGEST_LINE = 1000
+"""Characters of the longest error message: the longest list of known names has about 800."""
+LONGEST_WORD = 200
 """Characters of a user's word that a message repeats."""
 
 
@@ -62,7 +62,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _short(message: str) -> str:
-    """Return a message of argparse with its long words, which are the user's, cut."""
+    """Return a message on one line, with its long words, which are the user's, cut."""
     return " ".join(
         word if len(word) <= LONGEST_WORD else f"{word[:LONGEST_WORD]}..."
         for word in message.split()
@@ -116,12 +116,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code = run(parser(given[:1]).parse_args(given))
         sys.stdout.flush()
+    except BrokenPipeError:  # whoever read the output has read enough
+        _drop_output()
+        return EXIT_FAILED
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        if _output_lost():
-            return EXIT_FAILED
+        _drop_output()
         from trajectories.arguments import shortened
 
-        print("lpv-track:", shortened(error, 1000), file=sys.stderr)
+        print("lpv-track:", shortened(_short(str(error)), LONGEST_LINE), file=sys.stderr)
         return EXIT_USAGE
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
@@ -138,18 +140,11 @@ def _open_streams() -> None:
             stream.reconfigure(errors="replace")
 
 
-def _output_lost() -> bool:
-    """Return whether standard output can no longer be written, as a pipe whose reader has ended.
-
-    What is left to be written is then dropped, so that the end of the process says nothing of it.
-    """
+def _drop_output() -> None:
+    """Drop what standard output cannot take, so that the end of the process says nothing of it."""
     try:
         sys.stdout.flush()
-    except (OSError, ValueError) as error:
+    except OSError:
         null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, 1)
+        os.dup2(null, sys.stdout.fileno())
         os.close(null)
-        if not isinstance(error, BrokenPipeError):
-            print("lpv-track: standard output cannot be written:", error, file=sys.stderr)
-        return True
-    return False

@@ -2,9 +2,7 @@
 
 import dataclasses
 import math
-import sys
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.plausibility import GRAVITY, check_computable, check_plausible
-from trajectories.arguments import instance_of, shortened, shown
+from trajectories.arguments import Number, instance_of, shortened, shown
 from trajectories.fileio import read_json
 from trajectories.naming import suggestion
 
@@ -30,8 +28,11 @@ PARAMETER_ORDER = (
 
 def _finite(value: Any) -> bool:
     """Return whether a value is a number in double precision."""
-    number = isinstance(value, Real) and not isinstance(value, bool)
-    return number and -sys.float_info.max <= value <= sys.float_info.max
+    try:
+        Number().of("", value)
+    except ValueError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,9 @@ CUDA = re.compile(r"(nvidia|cuda|triton)\b")
 def compiled(extras: tuple[str, ...]) -> str:
     """Return the list of a set-up as uv writes it."""
     chosen = [word for extra in extras for word in ("--extra", extra)]
+    uv = Path(sys.executable).with_name("uv")
     done = subprocess.run(  # noqa: S603  words of this file
-        [Path(sys.executable).with_name("uv"), "pip", "compile", "pyproject.toml", "requirements/build.in", *chosen,
+        [uv, "pip", "compile", "pyproject.toml", "requirements/build.in", *chosen,
          "--universal", "--python-version", "3.11", "--constraint", "constraints.txt",
          "--generate-hashes", "--no-header", "--no-annotate", "--quiet"],
         cwd=HERE.parent, check=True, capture_output=True, text=True,

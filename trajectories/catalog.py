@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trajectories import files, shapes
-from trajectories.arguments import instance_of, shown
+from trajectories.arguments import Whole, flag, instance_of, shown
 from trajectories.curvature import PathStatistics, signed_waypoint_curvature
 from trajectories.naming import suggestion
 from trajectories.path import SPACING, ReferencePath
@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 KMH = 1.0 / 3.6
 GENERATOR = "segments/1"
+SEED = Whole(0, 2**128 - 1)
+"""Rule of the seed of a random path."""
 SEED_DIGITS = 40
 """Most digits of the seed of a random path."""
 
@@ -305,6 +307,8 @@ def random_path(
         If `length` is not a number from 0 to `shapes.LONGEST`.
     """
     alone = isinstance(seed, np.random.Generator)
+    seed = seed if isinstance(seed, np.random.Generator) else SEED.of("seed", seed)
+    fast = flag("fast", fast)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
     kind = "random-fast" if fast else "random"
     speeds, straights, lengths = (

@@ -1,5 +1,6 @@
 """Curvature of waypoints, statistics of a path, and bands of curvature."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -7,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from trajectories.arguments import Number, check_fields, instance_of, numbers, shown
 from trajectories.path import ReferencePath
 
 Array = NDArray[np.float64]
@@ -99,15 +101,18 @@ class CurvatureBands:
     hysteresis: float = 0.2
 
     def __post_init__(self) -> None:
-        edges = (0.0, *self.thresholds)
-        if not all(b > a for a, b in pairwise(edges)):
-            raise ValueError(f"thresholds must increase from above 0: {self.thresholds}")
-        if len(self.names) != len(self.thresholds) + 1:
-            raise ValueError(
-                f"{len(self.thresholds)} thresholds need {len(self.thresholds) + 1} names"
-            )
-        if not 0.0 <= self.hysteresis < 1.0:
-            raise ValueError(f"hysteresis must be in [0, 1), not {self.hysteresis}")
+        for name in ("thresholds", "names"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, tuple(instance_of(name, value, list | tuple, "a list")))
+        thresholds = numbers("thresholds", self.thresholds, Number(), len(self.thresholds))
+        object.__setattr__(self, "thresholds", thresholds)
+        if not all(b > a for a, b in pairwise((0.0, *thresholds))):
+            raise ValueError(f"thresholds must increase from above 0: {shown(thresholds)}")
+        if len(self.names) != len(thresholds) + 1:
+            raise ValueError(f"{len(thresholds)} thresholds need {len(thresholds) + 1} names")
+        for name in self.names:
+            instance_of("a name of a band", name, str, "a text")
+        check_fields(self, {"hysteresis": Number(0.0, math.nextafter(1.0, 0.0))})
 
     def __len__(self) -> int:
         return len(self.names)

@@ -63,7 +63,7 @@ class NmpcSettings:
     max_failures: int = 10
 
     def __post_init__(self) -> None:
-        if self.selection not in ("band", "path"):
+        if not (isinstance(self.selection, str) and self.selection in {"band", "path"}):
             raise ValueError(f"selection must be 'band' or 'path', not {shown(self.selection)}")
         if self.horizon is not None:
             check_fields(self, {"horizon": HORIZON})

@@ -25,6 +25,7 @@ from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
 from lpv_track_env.episodes import END_NAMES
 from lpv_track_env.validation import checked_mask, checked_mode, forwards_arguments
 from lpv_track_env.vector_env import PathTrackingVectorEnv
+from trajectories.arguments import instance_of
 from trajectories.naming import choose
 
 Array = NDArray[Any]
@@ -191,7 +192,8 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int = 1,
     ) -> None:
-        self.choice = WeightChoice() if choice is None else choice
+        choice = WeightChoice() if choice is None else choice
+        self.choice: WeightChoice = instance_of("choice", choice, WeightChoice, "WeightChoice")
         self.drives = PathTrackingVectorEnv(
             num_envs, autoreset_mode=AutoresetMode.DISABLED, threads=threads, **settings
         )

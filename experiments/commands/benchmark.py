@@ -43,7 +43,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shared.add_out(parser, "results/benchmark")
     shared.add_workers(parser)
     parser.add_argument(
-        "--case-limit", type=float, metavar="S",
+        "--case-limit", type=shared.number(0.0, 1e9, "s", above=True), metavar="S",
         help="a case that takes longer has failed, s (default 1800). With --workers 1 it cannot "
         "end an agent that is stuck in native code",
     )  # fmt: skip
@@ -56,6 +56,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     """Run the cases, print the tables, write the report; return 1 if a case failed, else 0."""
     from experiments.run import suites
     from experiments.run.benchmark import CASE_LIMIT, distinct, run_benchmark, selected
+    from experiments.run.case import Case
     from trajectories.naming import choose
 
     seeds = shared.seeds_of(options)
@@ -88,6 +89,10 @@ def run(options: argparse.Namespace, console: Console) -> int:
         "suite": suite, "agents": names, "seeds": list(seeds), **common,
         "agent_settings": shared.parse_settings(options.agent_set),
     }  # fmt: skip
+    if options.env:
+        # Refuse values that the environment does not accept before anything is driven.
+        Case(**specs[0]).check()
+        Case(**specs[0]).make_env().close()
     with shared.resumable(options, console, "the same command with --resume"):
         store = run_benchmark(
             specs, options.out, workers=options.workers, settings=settings,

@@ -278,4 +278,6 @@ def _observation_config(surroundings: str | Mapping[str, Any] | None) -> dict[st
     if isinstance(surroundings, str):
         return SURROUNDINGS[choose("surroundings", surroundings, tuple(SURROUNDINGS))]
     words = "a name, a configuration of highway-env or None"
-    return dict(instance_of("surroundings", surroundings, Mapping, words))
+    config = dict(instance_of("surroundings", surroundings, Mapping, words))
+    instance_of("surroundings['type']", config.get("type"), str, "a kind of observation")
+    return config

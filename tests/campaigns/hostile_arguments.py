@@ -17,8 +17,8 @@ from tests.campaigns import Counts, Say
 from tests.helpers.forked import forked
 
 SECONDS = 30.0
-LONGEST = 400
-"""Characters of the longest message."""
+LONGEST = 1000
+"""Characters of the longest message, lists of all known names included."""
 
 
 class Raises:

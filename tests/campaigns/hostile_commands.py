@@ -27,8 +27,8 @@ from tests.campaigns import Counts, Say
 from tests.helpers.forked import Ended, forked
 
 SECONDS = 60.0
-LONGEST = 400
-"""Characters of the longest refusal."""
+LONGEST = 1000
+"""Characters of the longest message, lists of all known names included."""
 REAL = 0.1
 """Share of the tries that are processes of their own, in a changed environment."""
 

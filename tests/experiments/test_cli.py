@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -420,6 +421,72 @@ def test_drive_refuses_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "--every must be" in refused(capsys, *command, "--every", "0")
     (tmp_path / "file").touch()
     assert "file" in refused(capsys, *command, "--frames", str(tmp_path / "file"))
+
+
+HOSTILE: dict[str, list[str]] = {
+    "cases without end": ["--seeds", "99999999999"],
+    "workers without end": ["--workers", "1000000000"],
+    "digits": ["--seeds", "1" * 5000],
+    "preview without end": ["--env", "preview_steps=100000000"],
+    "no time": ["--control-period", "1e-12"],
+    "no number": ["--control-period", "nan"],
+    "long": ["--vehicles", "x" * 500_000],
+    "long lines": ["--agents", "a b\n" * 100_000],
+    "long option": ["--no-" + "x" * 500_000],
+    "long setting": ["--env", "plant=" + "x" * 500_000],
+    "deep setting": ["--env", "plant=" + "[" * 100_000],
+    "escape": ["--suite", "\x1b[2J"],
+    "no folder": ["--out", ""],
+    "nul": ["--out", "a\0b"],
+}
+
+
+@pytest.mark.parametrize("arguments", HOSTILE.values(), ids=HOSTILE)
+def test_hostile_values_are_refused_at_once(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    began = time.monotonic()
+    small = ["benchmark", "--agents", "stanley", "--out", str(tmp_path / "out")]
+    small += [] if "--suite" in arguments else ["--trajectories", "u-turn"]
+    said = refused(capsys, *small, *arguments)
+    assert len(said) < 400
+    assert said.strip().isprintable()
+    assert time.monotonic() - began < 20.0
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize(
+    ("streams", "codes", "said"),
+    [
+        (">&-", {0}, ""),
+        (">&- 2>&-", {0}, ""),
+        ("<&-", {0}, ""),
+        (">/dev/full", {2}, "No space left on device"),
+        ("| true", {0, 1}, ""),
+    ],
+)
+def test_streams_that_cannot_be_used_end_in_one_line(
+    streams: str, codes: set[int], said: str
+) -> None:
+    line = shlex.join([*COMMAND, "trajectories", "u-turn"])
+    done = subprocess.run(
+        ["bash", "-c", f"{line} {streams}; exit ${{PIPESTATUS[0]}}"],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode in codes
+    assert said in done.stderr
+    assert done.stderr.count("\n") == bool(said)
+
+
+def test_any_terminal_can_print_the_tables() -> None:
+    done = subprocess.run(
+        [*COMMAND, "trajectories", "u-turn"], capture_output=True, timeout=60, check=False,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )  # fmt: skip
+    assert done.returncode == 0
+    assert b"u-turn" in done.stdout
+    assert done.stderr == b""
 
 
 def test_drive_without_any_display_is_one_line() -> None:
