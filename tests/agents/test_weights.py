@@ -270,7 +270,7 @@ def test_files_from_before_the_slew_limit_are_read(tmp_path: Path) -> None:
         (("weights", 3), {"P": [1]}, "unexpected keyword argument 'P'"),
         (("weights",), [], "4 bands need as many sets, not 0"),
         (("bands", "thresholds"), [0.02, 0.01, 0.05], "thresholds must increase"),
-        (("bands", "hysteresis"), 2.0, "hysteresis must be in"),
+        (("bands", "hysteresis"), 2.0, "hysteresis must be >= 0"),
         (("bands",), None, "NoneType"),
         (("blend",), 0.9, "zones must not overlap"),
         (("provenance",), 3, "int"),

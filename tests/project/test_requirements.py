@@ -53,9 +53,10 @@ def test_versions_are_those_of_the_constraints(name: str) -> None:
 def test_all_dependencies_are_listed() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
+    tested = extras["test"][0].split("[")[1].rstrip("]").split(",")
     sets = {
         "run": project["dependencies"],
-        "dev": [one for extra in extras if extra != "docs" for one in extras[extra]],
+        "dev": [one for extra in (*tested, "test", "dev") for one in extras[extra]],
         "docs": extras["docs"],
     }
     for name, dependencies in sets.items():
