@@ -119,8 +119,7 @@ def schedules() -> Reader:
 
 
 def _policies(noun: str) -> Reader:
-    from agents.learned.files import _digest
-    from tests.helpers.policy_files import KINDS
+    from tests.helpers.policy_files import KINDS, change
 
     kind = next(kind for kind in KINDS if kind.noun == noun)
     spec, weights = kind.whole()
@@ -131,10 +130,7 @@ def _policies(noun: str) -> Reader:
             reader(folder / "mine.json")
 
     def repair(folder: Path, rng: Rng) -> None:
-        content = json.loads(seed["mine.json"])
-        edit(content, rng)
-        content["digest"] = _digest({k: v for k, v in content.items() if k != "digest"})
-        (folder / "mine.json").write_text(json.dumps(content))
+        change(folder / "mine.json", lambda spec: edit(spec, rng))
 
     mutations = {"mine.json": JSON, next(name for name in seed if name != "mine.json"): BYTES}
     return Reader([seed], mutations, read, share=2, repair=repair)

@@ -100,6 +100,18 @@ def scale(content: bytes, _: bytes, rng: Rng) -> bytes:
     return NUMBER.sub(lambda found: repr(float(found.group()) * factor).encode(), content)
 
 
+def jitter(content: bytes, _: bytes, rng: Rng) -> bytes:
+    """Multiply a number in a hundred, or all of them, by about one, or by far more or less."""
+    share, spread = float(rng.choice([0.01, 1.0])), float(rng.choice([1e-3, 0.1, 3.0]))
+
+    def moved(found: "re.Match[bytes]") -> bytes:
+        if rng.random() > share:
+            return found.group()
+        return repr(float(found.group()) * float(np.exp(rng.normal(0.0, spread)))).encode()
+
+    return NUMBER.sub(moved, content)
+
+
 def lines(content: bytes, _: bytes, rng: Rng) -> bytes:
     """Swap, repeat, reverse or drop lines."""
     rows = content.split(b"\n")
@@ -159,7 +171,7 @@ def _places(whole: Any) -> Any:
 
 
 BYTES: tuple[Mutation, ...] = (flip, truncate, splice, drop, repeat, insert)
-TEXT: tuple[Mutation, ...] = (*BYTES, number, number, number, scale, lines, encode)
+TEXT: tuple[Mutation, ...] = (*BYTES, number, number, number, scale, jitter, jitter, lines, encode)
 JSON: tuple[Mutation, ...] = (*TEXT, value, value, value, value, value)
 
 
