@@ -170,7 +170,7 @@ def checked(value: object, kind: type[Value], name: object) -> Value:
     """
     try:
         return msgspec.convert(value, kind)
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, UnicodeError) as error:  # or half of a surrogate pair
         raise ValueError(f"{shortened(name)}: {shortened(error)}") from error
 
 

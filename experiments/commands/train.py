@@ -143,9 +143,10 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from experiments.jobs.console import TrainingDisplay, check_resume, need
 
     need("training", "rl", "stable_baselines3", "torch", "tensorboard")
-    from experiments.jobs.job import stored_settings
+    from experiments.jobs.job import SETTINGS, stored_settings
     from experiments.training.loop import POLICY, train
     from experiments.training.settings import with_steps
+    from trajectories.fileio import checked
 
     folder = options.out = options.out or Path("results/train") / options.algorithm
     resumed = check_resume(folder, "training", resume=options.resume)
@@ -156,7 +157,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
         if options.steps is None and resumed:
             # The number of steps that the first run found for its hours.
             stored = stored_settings(folder, "training") or {}
-            settings = with_steps(settings, int(stored["steps"]))
+            steps = checked(stored.get("steps"), int, f"{folder / SETTINGS}: steps")
+            settings = with_steps(settings, steps)
         elif options.steps is None:
             settings, at_most = fit_steps(settings, at_most, console)
 
