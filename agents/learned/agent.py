@@ -45,10 +45,10 @@ class LearnedPolicy:
 
     def __init__(self, task: DrivingTask, policy: str | Path | Policy) -> None:
         self.task = checked_task(task)
-        name = f"policy {policy.algorithm!r}" if isinstance(policy, Policy) else f"policy {policy}"
         self.policy = policy if isinstance(policy, Policy) else read(policy)
+        name = repr(policy.algorithm) if isinstance(policy, Policy) else policy
         check_compatible(
-            name, task, layout=self.policy.layout, control_period=self.policy.control_period,
+            f"policy {name}", task, layout=self.policy.layout, control_period=self.policy.control_period,
             vehicle=self.policy.training.get("vehicle"), stacklevel=4,
         )  # fmt: skip
         self._size = task.layout.size

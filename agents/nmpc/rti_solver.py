@@ -14,7 +14,7 @@ from agents.nmpc import linearisation, qp, rti
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import INPUTS, STATES, NmpcProblem, Solution, Status
 from lpv_track_env.bicycle import compiled_field, compiled_inverse_speed
-from trajectories.arguments import Number, Whole, checks_arguments, numbers
+from trajectories.arguments import Number, Whole, checks_arguments, instance_of, numbers
 from trajectories.compilation import compiled
 
 Array = NDArray[np.float64]
@@ -188,7 +188,7 @@ class RtiSolver:
         damping: tuple[float, float] = DAMPING,
         tolerance: float = 1e-12,
     ) -> None:
-        self.problem = problem
+        self.problem = instance_of("problem", problem, NmpcProblem, "an NmpcProblem")
         self.damping = numbers("damping", damping, Number(0.0, 1e9), INPUTS)
         car, order = problem.vehicle, np.array(L.SLACK_OF)
         first = problem.period if problem.first_period is None else problem.first_period
