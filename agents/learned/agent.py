@@ -48,8 +48,8 @@ class LearnedPolicy:
         self.policy = policy if isinstance(policy, Policy) else read(policy)
         name = repr(policy.algorithm) if isinstance(policy, Policy) else policy
         check_compatible(
-            f"policy {name}", task, layout=self.policy.layout, control_period=self.policy.control_period,
-            vehicle=self.policy.training.get("vehicle"), stacklevel=4,
+            f"policy {name}", task, layout=self.policy.layout,
+            control_period=self.policy.control_period, vehicle=self.policy.training.get("vehicle"), stacklevel=4,
         )  # fmt: skip
         self._size = task.layout.size
         self._network = Network.of(self.policy, *task.action_bounds)
