@@ -49,7 +49,8 @@ class LearnedPolicy:
         name = repr(policy.algorithm) if isinstance(policy, Policy) else policy
         check_compatible(
             f"policy {name}", task, layout=self.policy.layout,
-            control_period=self.policy.control_period, vehicle=self.policy.training.get("vehicle"), stacklevel=4,
+            control_period=self.policy.control_period,
+            vehicle=self.policy.training.get("vehicle"), stacklevel=4,
         )  # fmt: skip
         self._size = task.layout.size
         self._network = Network.of(self.policy, *task.action_bounds)
