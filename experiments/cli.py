@@ -54,6 +54,12 @@ class Parser(argparse.ArgumentParser):
         found = super()._get_option_tuples(option_string)
         return list({option[0]: option for option in found}.values())
 
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        # Python 3.11 takes `--option=--` for an option with an empty list.
+        if action.option_strings and "--" in arg_strings:
+            raise argparse.ArgumentError(action, "'--' is no value")
+        return super()._get_values(action, arg_strings)
+
     def error(self, message: str) -> NoReturn:
         """Raise a ValueError, which is one line, in place of the usage and an exit."""
         # As all other messages name an option and what it must be.

@@ -149,7 +149,6 @@ AROUND: dict[str, dict[str, Any]] = {
     "columns huge": {"env": {"COLUMNS": "1000000000"}},
     "nothing in the environment": {"env": dict.fromkeys(os.environ)},
     "threads": {"env": {"OMP_NUM_THREADS": "abc"}},
-    "folder deleted": {"shell": "", "deleted": True},
 }
 """What a process finds around it."""
 
@@ -292,8 +291,6 @@ def _as_process(one: Try) -> Ended:
     changed = {**os.environ, **around.get("env", {}), "PYTHONPATH": found}
     env = {name: value for name, value in changed.items() if value is not None}
     line = shlex.join([sys.executable, "-P", "-m", "experiments", *one.words])
-    if around.get("deleted"):
-        line = f'mkdir gone; cd gone; rmdir "$PWD"; {line}'
     line = f"{line} {around.get('shell', '')}; exit ${{PIPESTATUS[0]}}"
     with subprocess.Popen(
         ["bash", "-c", line], env=env, start_new_session=True,

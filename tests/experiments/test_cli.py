@@ -438,6 +438,8 @@ HOSTILE: dict[str, list[str]] = {
     "escape": ["--suite", "\x1b[2J"],
     "no folder": ["--out", ""],
     "nul": ["--out", "a\0b"],
+    "dashes": ["--control-period=--"],
+    "dashes among names": ["--agents=--"],
 }
 
 
