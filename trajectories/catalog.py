@@ -304,7 +304,7 @@ def random_path(
     Raises
     ------
     ValueError
-        If `length` is not a number from 0 to `shapes.LONGEST`.
+        If `length` does not keep to `shapes.LENGTHS`, or the seed is no whole number.
     """
     alone = isinstance(seed, np.random.Generator)
     seed = seed if isinstance(seed, np.random.Generator) else SEED.of("seed", seed)
@@ -321,7 +321,7 @@ def random_path(
         max_lateral_acceleration=float(rng.uniform(1.0, 2.0)),
         max_acceleration=float(rng.uniform(1.3, 2.0)),
     )
-    wanted = float(rng.uniform(*lengths)) if length is None else shapes.checked_length(length)
+    wanted = float(rng.uniform(*lengths)) if length is None else shapes.LENGTHS.of("length", length)
     segments = [shapes.Segment(length=float(rng.uniform(20.0, 50.0)))]
     planned = segments[0].length
     while planned < wanted:

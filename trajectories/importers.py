@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from trajectories.arguments import shown
+from trajectories.arguments import Number, flag, instance_of, numbers, shown
 from trajectories.geodesy import east_north_up
 from trajectories.path import MINIMUM_POINTS, SPACING, ReferencePath
 from trajectories.shapes import Geometry, from_geometry, smooth
@@ -45,6 +45,10 @@ CHUNK = 4096
 """Points whose neighbours are looked up at once."""
 MINIMUM_LENGTH, MAXIMUM_LENGTH = 1.0, 30_000.0
 """m: other lengths suggest that the coordinates are not metres."""
+SCALES = Number(0.0, 1e9, above=True)
+DISTANCES = Number(0.0, 1e9, "m")
+ORIGIN = Number(-1e6, 1e6)
+"""Rules of arguments."""
 LARGEST_COORDINATE = 1e7
 """m: larger coordinates are not on any map of the Earth."""
 
@@ -185,9 +189,11 @@ def read_gps(
             table.fail(f"line {table.lines[back[0] + 1]}: time goes back")
     if origin is None:
         origin = (float(angles["latitude"][0]), float(angles["longitude"][0]), float(height[0]))
+    latitude, longitude, above = numbers("origin", origin, ORIGIN, 3)
+    origin = latitude, longitude, above
     points = east_north_up(angles["latitude"], angles["longitude"], height, origin)[:, :2]
     importer = _Importer(table, "GPS log", limits, smoothing)
-    kept = importer.thinned(points, minimum_distance)
+    kept = importer.thinned(points, DISTANCES.of("minimum_distance", minimum_distance))
     importer.metadata["origin"] = dict(
         zip(("latitude_deg", "longitude_deg", "height_m"), origin, strict=True)
     )
@@ -220,6 +226,10 @@ class _Importer:
     metadata: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        instance_of("limits", self.limits, SpeedLimits, "SpeedLimits")
+        self.smoothing = DISTANCES.of("smoothing", self.smoothing)
+
     def warn(self, message: str) -> None:
         """Warn of a flaw that is accepted, and keep the message for the path's metadata."""
         self.warnings.append(message)
@@ -227,8 +237,7 @@ class _Importer:
 
     def scaled(self, points: Array, scale: float) -> Array:
         """Scale points (n, 2), and keep the factor for the metadata."""
-        if not (math.isfinite(scale) and scale > 0.0):
-            raise ValueError(f"scale must be positive, not {scale}")
+        scale = SCALES.of("scale", scale)
         if scale != 1.0:
             self.metadata["scale"] = scale
         return points * scale
@@ -244,8 +253,8 @@ class _Importer:
 
     def path(self, points: Array, name: str | None, closed: bool | None) -> ReferencePath:
         """Check points (n, 2), smooth and resample them, and plan a speed profile."""
-        if not (math.isfinite(self.smoothing) and self.smoothing >= 0.0):
-            raise ValueError(f"smoothing must be 0 or more, not {self.smoothing}")
+        closed = None if closed is None else flag("closed", closed)
+        label = self.table.file.stem if name is None else instance_of("name", name, str, "text")
         points = self._checked(points)
         points, closed = self._ends(points, closed)
         self._check_steps(points, closed)
@@ -254,8 +263,7 @@ class _Importer:
         self._check_curve(geometry, closed)
         try:
             return from_geometry(
-                geometry, self.limits, self.table.file.stem if name is None else name,
-                closed=closed,
+                geometry, self.limits, label, closed=closed,
                 source=f"{self.kind}: {self.table.file.name}",
                 smoothing=self.smoothing,
                 max_deviation=smoothed.max_deviation,

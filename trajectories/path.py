@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trajectories import projection, table
-from trajectories.arguments import shown
+from trajectories.arguments import Whole, array, flag, instance_of, shown
 
 SPACING = 0.25
 """m between nodes of every path, up to fitting its length exactly."""
 MINIMUM_POINTS = 4
 MINIMUM_SPEED = 0.05
 """m/s; a slower reference would take too long to arrive."""
+COUNTS = Whole(0, 100_000)
+"""Rule of the number of entries of a preview."""
 SEAM_GAP = 2e-3
 """Largest gap between the ends of a closed path, in m and, for the heading, in turns."""
 
@@ -52,10 +54,10 @@ class Preview(NamedTuple):
 
 def _finite(what: str, values: ArrayLike) -> Array:
     """Return values of any shape as an array; raise a ValueError unless all are finite."""
-    array = np.asarray(values, dtype=np.float64)
-    if not np.isfinite(array).all():
+    given = array(what, values)
+    if not np.isfinite(given).all():
         raise ValueError(f"{what} must be finite, not {shown(values)}")
-    return array
+    return given
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +104,16 @@ class ReferencePath:
 
     def __post_init__(self) -> None:
         columns = ("arc_length", "x", "y", "heading", "curvature", "speed")
+        instance_of("name", self.name, str, "text")
+        instance_of("metadata", self.metadata, Mapping, "a mapping")
+        object.__setattr__(self, "closed", flag("closed", self.closed))
         n = np.size(self.arc_length)
         if n < MINIMUM_POINTS:
             raise ValueError(
                 f"path {shown(self.name)}: {n} points, at least {MINIMUM_POINTS} are needed"
             )
         for column in columns:
-            values = np.array(getattr(self, column), dtype=np.float64)
+            values = array(column, getattr(self, column)).copy()
             if values.shape != (n,):
                 raise ValueError(
                     f"path {shown(self.name)}: {column} has shape {values.shape}, not ({n},)"
@@ -227,13 +232,17 @@ class ReferencePath:
         time grid, 1/m; `speed` (count,): speed at each interval's end, m/s.
         """
         _finite("arc length and period", (s, period))
+        count = COUNTS.of("count", count)
         values = np.empty(2 * count)
         table.preview(self.table, self.length, self.closed, float(s), float(period), values)
         return Preview(values[:count], values[count:])
 
     def with_speed(self, speed: ArrayLike, **metadata: Any) -> "ReferencePath":
         """Return the same geometry with another speed profile, a scalar or (n,), m/s."""
-        values = np.broadcast_to(np.asarray(speed, dtype=np.float64), self.arc_length.shape)
+        given = _finite("speed", speed)
+        if given.shape not in {(), self.arc_length.shape}:
+            raise ValueError(f"speed has shape {given.shape}, not () or {self.arc_length.shape}")
+        values = np.broadcast_to(given, self.arc_length.shape)
         return replace(self, speed=values, metadata={**self.metadata, **metadata})
 
     def mirrored(self) -> "ReferencePath":

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from trajectories.arguments import shown
+from trajectories.arguments import Number, shown
 from trajectories.path import SPACING, ReferencePath
 from trajectories.speed import SpeedLimits, plan_speed
 
@@ -40,8 +40,8 @@ Fit = TypeVar("Fit")
 Derivatives: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 """x, y, their first and their second derivatives, each (n,)."""
 
-LONGEST = 30_000.0
-"""Longest path that is made, m: planning its speed takes a minute."""
+LENGTHS = Number(0.0, 30_000.0, "m")
+"""Rule of a path's length: planning the speed of the longest takes a minute."""
 DEGREE = 5
 """Degree of the smoothing splines."""
 LEAST_KNOT_SPACING = 0.5
@@ -179,22 +179,9 @@ def fit(
     return fitted
 
 
-def checked_length(length: float) -> float:
-    """Return a path's length, m.
-
-    Raises
-    ------
-    ValueError
-        If it is not a number from 0 to `LONGEST`.
-    """
-    if not 0.0 <= length <= LONGEST:
-        raise ValueError(f"a path of {length:.6g} m: lengths must be from 0 to {LONGEST:g} m")
-    return float(length)
-
-
 def grid(length: float, spacing: float = SPACING) -> Array:
     """Uniform arc lengths from 0 to `length`, with a spacing as near to `spacing` as fits."""
-    return np.linspace(0.0, length, max(round(checked_length(length) / spacing), 3) + 1)
+    return np.linspace(0.0, length, max(round(LENGTHS.of("length", length) / spacing), 3) + 1)
 
 
 def build(segments: Sequence[Segment]) -> Geometry:

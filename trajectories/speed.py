@@ -7,16 +7,15 @@ tightens it, and every iterate is feasible (Lipp and Boyd, Minimum-time speed op
 fixed path, 2014, for the variable b; the linearisation of the jerk bound is this project's).
 """
 
-from dataclasses import dataclass
-from numbers import Real
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import linprog
 
-from trajectories.arguments import shown
-from trajectories.path import ReferencePath
+from trajectories.arguments import Number, array, check_fields, instance_of
+from trajectories.path import MINIMUM_POINTS, ReferencePath
 
 Array = NDArray[np.float64]
 
@@ -32,8 +31,9 @@ SEAM = 1e-6
 """Largest difference of the speeds at a lap's ends, m/s: a jerk of some mm/s^3."""
 MORE_LAPS = 4
 """Attempts with one more lap at either end until the ends of the middle one meet."""
-SMALLEST, LARGEST = 1e-3, 1e6
-"""Smallest and largest limit of a profile, in SI units."""
+LIMIT = Number(1e-3, 1e6)
+"""Rule of every limit of a profile, in SI units."""
+SPACINGS = Number(1e-3, 1e9, "m")
 LONGEST = 100_000.0
 """m: longest path that is planned, all laps of a closed one included; it takes minutes."""
 CHATTER_WEIGHT = 2e-3
@@ -80,15 +80,9 @@ class SpeedLimits:
     min_speed: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            number = isinstance(value, Real) and not isinstance(value, bool)
-            if name == "max_deceleration" and value is None:
-                continue
-            if not (number and SMALLEST <= value <= LARGEST):
-                raise ValueError(
-                    f"speed limits: {name} must be from {SMALLEST:g} to {LARGEST:g}, "
-                    f"not {shown(value)}"
-                )
+        given = [name for name, value in vars(self).items() if value is not None]
+        needed = {item.name for item in fields(self)} - {"max_deceleration"}
+        check_fields(self, dict.fromkeys(sorted(needed | set(given)), LIMIT), "speed limits: ")
 
     @property
     def deceleration(self) -> float:
@@ -132,8 +126,19 @@ def plan_speed(
     RuntimeError
         If the linear programme finds no profile; the message contains the solver's.
     ValueError
-        If the path, with the laps that it takes to reach full speed, is longer than `LONGEST`.
+        If the path, with the laps that it takes to reach full speed, is longer than `LONGEST`, or
+        an argument is of another kind.
     """
+    instance_of("limits", limits, SpeedLimits, "SpeedLimits")
+    spacing, curvature = SPACINGS.of("spacing", spacing), array("curvature", curvature)
+    if curvature.ndim != 1 or len(curvature) < MINIMUM_POINTS or not np.isfinite(curvature).all():
+        raise ValueError(
+            f"curvature must be at least {MINIMUM_POINTS} finite numbers in a row, not of shape "
+            f"{curvature.shape}"
+        )
+    share = array("share", share)
+    if share.shape not in {(), curvature.shape} or not (share > 0.0).all() or share.max() > 1e3:
+        raise ValueError("share must be positive numbers, one or as many as there are curvatures")
     if closed:
         lap, n = spacing * (len(curvature) - 1), len(curvature) - 1
         weakest = min(limits.max_acceleration, limits.deceleration)

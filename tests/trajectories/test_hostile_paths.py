@@ -124,7 +124,7 @@ def test_pipes_and_files_too_large_are_refused(
 def test_speed_limits_are_bounded(change: dict[str, Any]) -> None:
     usual = {"max_speed": 10.0, "max_lateral_acceleration": 2.0, "max_acceleration": 1.5}
     name = next(iter(change))
-    assert f"{name} must be from 0.001 to 1e+06" in refusal(SpeedLimits, **{**usual, **change})
+    assert f"{name} must be in [0.001, 1e+06]" in refusal(SpeedLimits, **{**usual, **change})
 
 
 def test_profiles_that_would_take_hours_are_refused() -> None:
@@ -136,10 +136,10 @@ def test_profiles_that_would_take_hours_are_refused() -> None:
 
 @pytest.mark.parametrize("length", [1e9, math.inf, math.nan, -1.0])
 def test_paths_of_absurd_lengths_are_refused(length: float) -> None:
-    assert "lengths must be from 0 to 30000 m" in refusal(random_path, 0, length=length)
+    assert "length must be >= 0 and at most 30000 m" in refusal(random_path, 0, length=length)
     if length > 0.0:
         segments = [shapes.Segment(length=length)]
-        assert "lengths must be from 0 to" in refusal(shapes.build, segments)
+        assert "length must be >= 0 and at most" in refusal(shapes.build, segments)
 
 
 @pytest.mark.parametrize("name", ["random-" + "9" * 100_000, "x" * 500_000, "\0", "a\nb.csv"])
@@ -166,7 +166,7 @@ def lines(tmp_path: Path) -> list[str]:
         ("limits", 5, "got `int` - at `$.limits`"),
         ("limits", {"max_speed": 1.0}, "missing required field"),
         ("limits", {"max_speed": -1.0, "max_lateral_acceleration": 1.0, "max_acceleration": 1.0},
-         "speed limits: max_speed must be from"),
+         "speed limits: max_speed must be in"),
         ("origin", {"latitude_deg": "x"}, "$.origin"),
         ("source", [], "$.source"),
         ("name", 3, "$.name"),
@@ -194,3 +194,52 @@ def test_a_header_may_hold_any_other_json(lines: list[str], tmp_path: Path) -> N
     found = read(file)
     assert isinstance(found, ReferencePath)
     assert found.metadata["own"] == {"a": [1, None, "x"]}
+
+
+WRONG: tuple[Any, ...] = (
+    None,
+    "x",
+    [],
+    {},
+    math.nan,
+    math.inf,
+    -1.0,
+    10**400,
+    np.zeros((2, 2)),
+    "x" * 500_000,
+)
+
+
+@pytest.fixture(scope="module")
+def points(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("points") / "points.csv"
+    angle = np.linspace(0.0, 2.0, 40)
+    cells = [f"{48.0 + 2e-4 * math.sin(a)},{11.0 + 2e-4 * math.cos(a)}" for a in angle]
+    file.write_text("\n".join(["lat,lon", *cells, ""]))
+    return file
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=lambda value: type(value).__name__)
+@pytest.mark.parametrize("key", ["closed", "origin", "minimum_distance", "limits", "smoothing"])
+def test_arguments_of_importers_are_refused_in_a_short_line(
+    key: str, wrong: Any, points: Path
+) -> None:
+    if wrong is None and key in {"closed", "origin"}:
+        assert importers.read_gps(points).length > 20.0
+    else:
+        assert key in refusal(importers.read_gps, points, **{key: wrong})
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=lambda value: type(value).__name__)
+def test_arguments_of_paths_are_refused_in_a_short_line(wrong: Any) -> None:
+    path = trajectories.load("straight")
+    if wrong is not None:
+        refusal(random_path, 0, length=wrong)
+    refusal(random_path, "x" if wrong is None else wrong)
+    refusal(path.preview, 0.0, 0.1, wrong)
+    refusal(path.with_speed, wrong)
+    refusal(plan_speed, path.curvature, wrong, IMPORT_LIMITS)
+    refusal(plan_speed, wrong, 0.25, IMPORT_LIMITS)
+    refusal(plan_speed, path.curvature, 0.25, wrong)
+    refusal(trajectories.statistics, wrong)
+    refusal(trajectories.CurvatureBands, thresholds=wrong)
