@@ -64,6 +64,7 @@ def statistics(path: ReferencePath) -> PathStatistics:
     Total curvature is the literal sum of |kappa_i| over waypoints 0.25 m apart (see the project's
     errata); the last waypoint of a closed path, which repeats the first, does not count.
     """
+    instance_of("path", path, ReferencePath, "a ReferencePath")
     curvature = np.abs(path.curvature)
     once = curvature[:-1] if path.closed else curvature
     return PathStatistics(

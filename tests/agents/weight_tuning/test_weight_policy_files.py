@@ -205,7 +205,7 @@ def of_base(**changes: Any) -> Callable[[dict[str, Any]], None]:
         (lambda s: s["choice"]["base"]["bands"].update(thresholds=[3.0, 2.0, 1.0]),
          "choice.base: thresholds must increase"),
         (lambda s: s["choice"]["base"]["bands"].update(hysteresis=1),
-         "choice.base: hysteresis must be in"),
+         "choice.base: hysteresis must be"),
     ],
 )  # fmt: skip
 def test_a_spec_that_says_something_else_is_refused(
