@@ -28,7 +28,7 @@ from agents.weight_tuning.loop_memory import LoopMemory, LoopRow
 from agents.weight_tuning.policy import WeightPolicy, load
 from agents.weights import TrackingWeights, WeightSchedule, weights_from
 from lpv_track_env.validation import forwards_arguments
-from trajectories.arguments import flag, shown
+from trajectories.arguments import flag, shortened
 from trajectories.compilation import entry_point
 
 Weights = WeightPolicy | WeightSchedule | TrackingWeights
@@ -223,7 +223,7 @@ def _loaded(weights: str | Path | Mapping[str, Any] | Weights) -> Weights:
     file = SHIPPED.get(str(weights), Path(weights))
     if not os.path.isfile(file):  # noqa: PTH113  Path.is_file raises for names that no file has
         raise ValueError(
-            f"weights {shown(str(weights))}: no such file; give weights= the .json of a schedule "
+            f"weights {shortened(weights)}: no such file; give weights= the .json of a schedule "
             f"or of a policy of weights, or as shipped: {', '.join(SHIPPED)}"
         )
     return load(file)
