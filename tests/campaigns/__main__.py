@@ -12,7 +12,7 @@ CAMPAIGNS = {
     "hostile_solves": (1_000_000, "rows of absurd observations for every shipped agent"),
     "hostile_files": (20_000, "mutated files over every reader"),
     "hostile_commands": (300, "command lines with wrong values"),
-    "hostile_arguments": (5_000, "arguments of wrong types and absurd values"),
+    "hostile_arguments": (3_000, "arguments of wrong types and absurd values"),
     "kill_jobs": (100, "kill -9 of benchmark, train and tune at random moments"),
     "soak": (10_000_000, "steps of vector environments with all settings"),
 }

@@ -8,8 +8,8 @@ import pytest
 from tests.campaigns.__main__ import CAMPAIGNS
 
 SMALL = {
-    "hostile_solves": 200, "hostile_files": 200, "hostile_commands": 20, "kill_jobs": 3,
-    "soak": 20_000, "hostile_arguments": 100,
+    "hostile_solves": 200, "hostile_files": 200, "hostile_commands": 10, "kill_jobs": 3,
+    "soak": 20_000, "hostile_arguments": 15,
 }  # fmt: skip
 
 
