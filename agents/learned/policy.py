@@ -3,7 +3,6 @@
 Functions called `check...` raise a ValueError that names the value and what is wrong with it.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +24,7 @@ from agents.learned.files import (
 from agents.learned.storage import write_files
 from lpv_track_env.observation import SCALARS, ObservationLayout
 from lpv_track_env.task import checked_period
-from trajectories.arguments import instance_of, shortened, shown
+from trajectories.arguments import Number, instance_of, shortened, shown
 from trajectories.naming import choose
 
 Weights = NDArray[np.float32]
@@ -266,15 +265,7 @@ def checked_name(algorithm: object) -> str:
 
 def checked_number(name: str, value: Any) -> float:
     """Convert a finite number to a float; booleans are refused."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise ValueError(f"{name} must be a number, not {shown(value)}")  # noqa: TRY004
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise ValueError(f"{name} must be finite, not {number}")
-    return number
+    return Number().of(name, value)
 
 
 def _array(name: str, value: ArrayLike, dtype: type[np.floating[Any]]) -> NDArray[Any]:

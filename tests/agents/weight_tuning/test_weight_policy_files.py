@@ -131,7 +131,7 @@ def test_what_is_no_policy_is_named(changes: dict[str, Any], reason: str) -> Non
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"span": "10"}, "span must be a number, not '10'"),
+        ({"span": "10"}, "span must be a finite number, not '10'"),
         ({"span": True}, "span must be a number"),
         ({"span": 1.0}, "span must be above 1"),
         ({"span": float("nan")}, "span must be finite"),
