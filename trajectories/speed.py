@@ -34,7 +34,9 @@ MORE_LAPS = 4
 LIMIT = Number(1e-3, 1e6)
 """Rule of every limit of a profile, in SI units."""
 SPACINGS = Number(1e-3, 1e9, "m")
-LONGEST = 100_000.0
+LONG_LAP = 5_000.0
+"""m: lap from which a part of it, not all, is planned before and after."""
+LONGEST = 40_000.0
 """m: longest path that is planned, all laps of a closed one included; it takes minutes."""
 CHATTER_WEIGHT = 2e-3
 """Weight of the L1 penalty on changes of acceleration; without it profiles chatter at the caps."""
@@ -120,6 +122,7 @@ def plan_speed(
 
     An open path starts and ends at `limits.end_speed`. A closed path is planned over three laps, or
     over more if it takes them to reach full speed, and the middle lap is kept, so its ends meet.
+    Laps of `LONG_LAP` or more are planned with as much before and after as reaches full speed.
 
     Raises
     ------
@@ -145,17 +148,19 @@ def plan_speed(
         run_up = limits.max_speed * (
             0.5 * limits.max_speed / weakest + 2.0 * weakest / limits.max_jerk
         )
-        before = max(int(np.ceil(run_up / lap)), 1)
-        _check_length((2 * before + 1) * lap)
+        # Whole laps before and after; a long lap needs no more of them than the way to full speed.
+        run_up = np.ceil(run_up / lap) * lap if lap < LONG_LAP else min(4.0 * run_up, lap)
+        _check_length(2.0 * run_up + lap)
+        more = max(round(run_up / spacing), 1)
         shares = np.broadcast_to(share, curvature.shape)
-        # The jerk bound lets a stop affect speeds far away: add laps until the ends meet.
-        for around in range(before, before + MORE_LAPS):
-            if around > before and (2 * around + 1) * lap > LONGEST:
+        # The jerk bound lets a stop affect speeds far away: plan more until the ends meet.
+        for around in range(more, more + MORE_LAPS * min(more, n), min(more, n)):
+            if around > more and spacing * (2 * around + n) > LONGEST:
                 break
-            laps = np.append(np.tile(curvature[:-1], 2 * around + 1), curvature[-1])
-            shared = np.append(np.tile(shares[:-1], 2 * around + 1), shares[-1])
-            speed = plan_speed(laps, spacing, limits, share=shared)
-            speed = speed[around * n : (around + 1) * n + 1].copy()
+            nodes = np.arange(-around, n + around + 1) % n
+            nodes[-1] = nodes[-1] or n
+            speed = plan_speed(curvature[nodes], spacing, limits, share=shares[nodes])
+            speed = speed[around : around + n + 1].copy()
             if abs(speed[-1] - speed[0]) < SEAM:
                 break
         speed[-1] = speed[0]

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import time
 import warnings
 from collections.abc import Iterator
@@ -17,6 +18,8 @@ UNLOCKED = ("report.html", "training.png")
 """Files that are also written without the lock, so that a report can be made during a sweep."""
 PLACES = (".", "traces", "judged/*")
 """Folders within a folder that only the holder of its lock writes in."""
+LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.tmp")
+"""Names of the temporary files of `trajectories.fileio.write_atomically`."""
 ABANDONED = 60.0
 """Age from which a temporary file of `UNLOCKED` is a leftover, s; writing one takes a second."""
 
@@ -62,8 +65,14 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files of killed writers from a folder and its `PLACES`."""
+    """Remove the temporary files of killed writers from a folder and its `PLACES`.
+
+    Links to folders are not followed: a foreign folder could lead anywhere.
+    """
     for file in [file for place in PLACES for file in folder.glob(f"{place}/.*.tmp")]:
+        inside = file.parent.resolve().is_relative_to(folder.resolve())
+        if not (inside and file.is_file() and LEFTOVER.fullmatch(file.name)):
+            continue
         shared = file.name.startswith(tuple(f".{name}." for name in UNLOCKED))
         with contextlib.suppress(FileNotFoundError):
             if not shared or time.time() - file.stat().st_mtime > ABANDONED:

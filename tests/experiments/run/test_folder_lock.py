@@ -57,8 +57,8 @@ def test_a_second_sweep_in_a_folder_is_refused(tmp_path: Path, holder: Any) -> N
 
 
 def test_leftovers_of_killed_writers_go_and_other_files_stay(tmp_path: Path) -> None:
-    gone = [tmp_path / ".manifest.json.0a.tmp", tmp_path / "traces" / ".a.npz.0b.tmp"]
-    kept = [tmp_path / ".report.html.0c.tmp", tmp_path / "notes.tmp", tmp_path / ".tmp"]
+    gone = [tmp_path / ".manifest.json.0a1b2c3d.tmp", tmp_path / "traces" / ".a.npz.0b1b2c3d.tmp"]
+    kept = [tmp_path / ".report.html.0c1b2c3d.tmp", tmp_path / "notes.tmp", tmp_path / ".tmp"]
     (tmp_path / "traces").mkdir()
     for file in gone + kept:
         file.touch()
@@ -70,6 +70,19 @@ def test_leftovers_of_killed_writers_go_and_other_files_stay(tmp_path: Path) -> 
     os.utime(kept[0], (past, past))
     with locked(tmp_path):
         assert [file.exists() for file in kept] == [False, True, True]
+
+
+def test_only_files_of_our_own_making_within_the_folder_are_removed(tmp_path: Path) -> None:
+    folder, own = tmp_path / "results", tmp_path / "own"
+    for place in (folder / ".a.json.0a1b2c3d.tmp", own):
+        place.mkdir(parents=True)
+    (folder / "traces").symlink_to(own, target_is_directory=True)
+    others = [own / ".a.npz.0a1b2c3d.tmp", folder / ".a.json.tmp", folder / ".vim.1234.tmp"]
+    for file in others:
+        file.touch()
+    with locked(folder):
+        pass
+    assert all(file.exists() for file in others)
 
 
 def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path: Path) -> None:
