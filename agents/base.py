@@ -219,10 +219,9 @@ class TrackingAgent(ABC, Generic[Memory]):
     def __init__(self, task: DrivingTask) -> None:
         self.task = checked_task(task)
         self.replaced_actions = 0
-        self._size = task.layout.size
         self._low, self._high = task.action_bounds
         self._memories: list[Memory] = []
-        self._kind: type | None = None
+        self._memory_types: set[type] = set()
 
     @abstractmethod
     def control(self, observation: TrackingObservation, memory: Memory) -> tuple[float, float]:
@@ -271,15 +270,15 @@ class TrackingAgent(ABC, Generic[Memory]):
         TypeError
             If `state` is not this agent's memory.
         """
-        rows = observation_rows(observation, self._size)
+        rows = observation_rows(observation, self.task.layout.size)
         memories = self._memories if state is None else self._own(state)
         started = started_rows(episode_start, len(rows))
         if len(memories) != len(rows):
-            memories = [self.new_memory() for _ in rows]
+            memories = [self._made_memory() for _ in rows]
         elif started:
             memories = memories.copy()
             for k in started:
-                memories[k] = self.new_memory()
+                memories[k] = self._made_memory()
         if state is None:
             self._memories = memories
         actions = np.empty((len(rows), 2), dtype=np.float32)
@@ -289,20 +288,28 @@ class TrackingAgent(ABC, Generic[Memory]):
 
     def _own(self, state: list[Memory]) -> list[Memory]:
         """Check that memories given by the caller are such as `new_memory` makes."""
-        if self._kind is None:
-            self._kind = type(self.new_memory())
         if not isinstance(state, list):
             raise foreign(state)
+        if not self._memory_types:
+            self._made_memory()
         for memory in state:
-            if type(memory) is not self._kind:
+            if type(memory) not in self._memory_types:
                 raise foreign(memory)
         return state
+
+    def _made_memory(self) -> Memory:
+        """Make a memory, and keep its type in mind: those of one agent may differ."""
+        memory = self.new_memory()
+        self._memory_types.add(type(memory))
+        return memory
 
     def _bounded(self, row: NDArray[np.float64], memory: Memory) -> tuple[float, float]:
         """Return inputs for one observation, finite and within the bounds of the actions."""
         observation = self.task.layout.unpack(row)
         control = self.control if np.isfinite(row).all() else self.control_blind
-        given = control(observation, memory)
+        given: Any = control(observation, memory)
+        if getattr(given, "shape", None) == (1, 2):  # a network's batch of one
+            given = given[0]
         a, delta = two_numbers(given)
         if not (math.isfinite(a) and math.isfinite(delta)):
             if self.replaced_actions == 0:

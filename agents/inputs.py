@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.observation import PREVIEW_BOUNDS, PREVIEW_START, SCALARS
+from trajectories.arguments import shown
 from trajectories.compilation import compiled, compiled_internal
 
 
@@ -29,7 +30,7 @@ class BatchMemory(Protocol):
 
 Memory = TypeVar("Memory", bound=BatchMemory)
 
-NUMBERS, MARKS = "fiu", "biu"
+NUMBERS, MARKS = "fiu", "biuf"
 """Kinds of NumPy types that observations and `episode_start` may have."""
 
 # In the precision of the environments' observations, so that theirs never change.
@@ -89,6 +90,8 @@ def observation_rows(observation: Any, size: int) -> NDArray[np.float64]:
 def started_rows(episode_start: Any, rows: int) -> list[int]:
     """Return the rows that `episode_start` marks: one value for all rows, or one for each.
 
+    Truth values may also be 0 and 1 of any type of number, such as float32 in replay buffers.
+
     Raises
     ------
     ValueError
@@ -99,6 +102,8 @@ def started_rows(episode_start: Any, rows: int) -> list[int]:
     marks = episode_start
     if type(marks) is not np.ndarray or marks.dtype.kind not in MARKS:
         marks = _array("episode_start", marks, MARKS)
+    if marks.dtype.kind == "f" and not ((marks == 0.0) | (marks == 1.0)).all():
+        raise ValueError(f"episode_start must be truth values, or 0 and 1, not {shown(marks)}")
     if marks.size == 1:  # several times as fast as any()
         return list(range(rows)) if marks.item() else []
     if marks.shape != (rows,):

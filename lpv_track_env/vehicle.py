@@ -106,6 +106,9 @@ class VehicleParameters:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value, wanted = getattr(self, field.name), None
+            if field.name == "source" and isinstance(value, str):
+                value = " ".join(value.split())  # may be written on several lines
+                object.__setattr__(self, field.name, value)
             if field.name in {"name", "source"}:
                 wanted = None if isinstance(value, str) and value.isprintable() else "a text line"
             elif field.name == "implausible":

@@ -23,7 +23,7 @@ from trajectories.arguments import Whole, check_fields, instance_of, shown
 Array = NDArray[np.float64]
 Memory = TypeVar("Memory")
 
-FAILURES = Whole(1, 1_000_000_000)
+FAILURES = Whole(0, 1_000_000_000)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -128,6 +128,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         self._threads = checked_threads(threads)
         self._work = layout.working_space(self.problem.horizon, shares(self._threads))
         self._memory: RtiMemory | None = None
+        self._size = task.layout.size
         # Called with zero rows to trigger compilation here, not in the first control period.
         blank, none = self._new(0), np.zeros((0, self._size))
         self._blank = blank

@@ -123,7 +123,9 @@ def test_other_beginnings_of_episodes_are_refused(name: str, starts: Any) -> Non
 @each_agent
 def test_beginnings_may_be_given_in_every_usual_form(name: str) -> None:
     agent, rows = made(name), good_rows()
-    for starts in (True, [True], [1, 1], np.ones(2, dtype=bool), torch.ones(2, dtype=torch.bool)):
+    numbers = 1.0, [1, 1], [1.0, 1.0], np.ones(2, dtype=np.float32), torch.ones(2)
+    truths = True, [True], np.ones(2, dtype=bool), torch.ones(2, dtype=torch.bool)
+    for starts in (*numbers, *truths):
         again, _ = agent.predict(rows[:2], None, starts)
         agent.reset()
         np.testing.assert_array_equal(again, agent.predict(rows[:2])[0])
@@ -192,6 +194,34 @@ def test_what_is_no_pair_of_inputs_is_refused(given: Any) -> None:
     agent = Lost(made("stanley").task, given)
     with pytest.raises(ValueError, match="action must be two numbers"):
         agent.predict(good_rows()[:3])
+
+
+def test_a_batch_of_one_is_a_pair_of_inputs() -> None:
+    task, rows = made("stanley").task, good_rows()[:3]
+    for given in (np.array([[0.1, 0.0]]), torch.tensor([[0.1, 0.0]])):
+        actions, _ = Lost(task, given).predict(rows)
+        np.testing.assert_array_equal(actions, np.float32([[0.1, 0.0]] * 3))
+
+
+class Varied(TrackingAgent[Any]):
+    """Makes memories of two types by turns."""
+
+    made = 0
+
+    def new_memory(self) -> Any:
+        self.made += 1
+        return {} if self.made % 2 else None
+
+    def control(self, observation: Any, memory: Any) -> tuple[float, float]:  # noqa: ARG002
+        return 0.1, 0.0
+
+
+def test_memories_of_one_agent_may_differ_in_type() -> None:
+    agent, rows = Varied(made("stanley").task), good_rows()[:3]
+    _, memory = agent.predict(rows)
+    agent.predict(rows, memory, [True, False, False])
+    with pytest.raises(TypeError, match="not this agent's memory but list"):
+        agent.predict(rows, [[], [], []])
 
 
 @pytest.mark.parametrize("own", [True, False])

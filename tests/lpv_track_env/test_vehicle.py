@@ -320,6 +320,10 @@ def test_values_of_wrong_types_are_one_short_line(change: dict[str, object], mes
     assert len(str(caught.value)) < 300
 
 
+def test_a_source_may_be_written_on_several_lines() -> None:
+    assert M2_MINIBUS.replace(source="A Car,\n  2nd\u00a0edition").source == "A Car, 2nd edition"
+
+
 def test_a_pipe_is_no_vehicle(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.json")
     with pytest.raises(ValueError, match="no regular file"):
