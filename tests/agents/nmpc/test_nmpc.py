@@ -232,7 +232,7 @@ def test_bad_settings_are_refused() -> None:
         NmpcProblem(M2_MINIBUS, horizon=0)
     with pytest.raises(ValueError, match="period"):
         NmpcProblem(M2_MINIBUS, period=float("nan"))
-    with pytest.raises(ValueError, match="penalties"):
+    with pytest.raises(ValueError, match=r"linear_penalty\[0\] must be >= 0"):
         NmpcProblem(M2_MINIBUS, linear_penalty=(-1.0, 1.0, 1.0))
     env = gymnasium.make(ID, trajectory="straight")
     for name in NAMES:

@@ -112,7 +112,7 @@ def test_without_limits_it_is_the_linear_quadratic_regulators(
     free = M2_MINIBUS.replace(
         acceleration_range=(-1e4, 1e4), longitudinal_acceleration_range=(-1e4, 1e4),
         max_jerk=1e6, max_steering_angle=1e3, max_steering_rate=1e6,
-        max_lateral_velocity_ratio=1e3, speed_range=(1e-3, 1e4),
+        max_lateral_velocity_ratio=1e3, speed_range=(1e-3, 1e4), implausible=True,
     )  # fmt: skip
     problem, rng = NmpcProblem(free, horizon=n, first_period=0.03), np.random.default_rng(2)
     narrow = NmpcProblem(M2_MINIBUS, horizon=n, first_period=0.03)

@@ -209,9 +209,10 @@ def read_on(reader: Reader, said: Connection) -> None:
 
 
 def named(process: int | None) -> list[str]:
-    """Shared memory of a process that has a name, which would outlive the process."""
+    """Return the shared memory of a process that has a name, which would outlive the process."""
     maps = Path(f"/proc/{process}/maps")
-    return [line for line in maps.read_text().splitlines() if "/dev/shm/" in line]  # noqa: S108
+    mapped = [line for line in maps.read_text().splitlines() if "/dev/shm/" in line]  # noqa: S108
+    return [line for line in mapped if not line.endswith(" (deleted)")]
 
 
 def test_the_memory_has_no_name_that_could_be_left() -> None:
