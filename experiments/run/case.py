@@ -1,5 +1,6 @@
 """Cases: a benchmark is a list of them, each a small plain dict in and a plain dict out."""
 
+import contextlib
 import hashlib
 import inspect
 import json
@@ -308,7 +309,9 @@ def run_case(spec: Mapping[str, Any], kind: type[BaseCase] = Case) -> dict[str, 
     }  # fmt: skip
     result, began = dict(first), time.perf_counter()
     try:
-        case.drive(result)
+        # An agent may change the working directory, on which names of files depend.
+        with contextlib.chdir("."):
+            case.drive(result)
         return as_stored({**result, "seconds": time.perf_counter() - began})
     except BaseException as error:
         # A worker ignores Ctrl-C: there, the agent itself raised it.

@@ -76,8 +76,9 @@ class TimeLimit:
     """Context that raises OutOfTime in its own code after some seconds, then again every second.
 
     It ends Python code. A call of native code, such as a solver or a compiled loop, is left to
-    return first; code that never does can only be ended from another process. The limit needs the
-    main thread and a system with SIGALRM, and is ignored elsewhere.
+    return first; code that never does, or that catches every exception, can only be ended from
+    another process. The limit needs the main thread and a system with SIGALRM, and is ignored
+    elsewhere.
 
     Parameters
     ----------

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import os
 import sys
 import time
 
@@ -33,6 +34,14 @@ class Rolls:
 
     def predict(self, _observation, state=None, *_, **__):
         return np.array([self.rolling, 0.0]), (state,)
+
+
+class Moves(Rolls):
+    """Changes the working directory."""
+
+    def predict(self, observation, state=None, *_, **__):
+        os.chdir("/")
+        return super().predict(observation, state)
 
 
 class Explains(Rolls):

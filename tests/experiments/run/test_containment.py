@@ -48,6 +48,15 @@ def test_whatever_a_case_raises_the_others_are_run(tmp_path: Path) -> None:
     shout.encode("ascii")
 
 
+def test_an_agent_that_changes_the_working_directory_takes_no_results_along(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = swept(Path("out"), ["Moves", "Rolls"])
+    assert {name: case["status"] for name, case in found.items()} == {"Moves": "ok", "Rolls": "ok"}
+    assert (tmp_path / "out" / "cases.jsonl").read_bytes().count(b"\n") == 2
+
+
 def test_values_of_numpy_are_stored_as_plain_json(tmp_path: Path) -> None:
     result = run_case(spec("Explains"))
     assert result["status"] == "ok"
