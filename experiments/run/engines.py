@@ -96,7 +96,8 @@ class TimeLimit:
         possible = hasattr(signal, "setitimer") and math.isfinite(self.seconds)
         if possible and threading.current_thread() is threading.main_thread():
             self._before = signal.signal(signal.SIGALRM, self._end)
-            signal.setitimer(signal.ITIMER_REAL, self.seconds, 1.0)
+            # Not before the context is entered.
+            signal.setitimer(signal.ITIMER_REAL, max(self.seconds, 0.001), 1.0)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:

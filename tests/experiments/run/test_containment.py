@@ -10,6 +10,7 @@ from rich.console import Console
 
 from experiments.run.benchmark import run_benchmark
 from experiments.run.case import run_case
+from experiments.run.engines import TimeLimit
 from experiments.run.result_schema import plain
 from experiments.run.store import ResultStore
 from tests.helpers import faulty_agents
@@ -86,6 +87,13 @@ def test_workers_survive_what_ends_a_process_and_are_killed_in_native_code(tmp_p
     assert found["Exits"]["error"] == EXPECTED["Exits"]
     assert found["Rolls"]["status"] == "ok"
     assert time.monotonic() - began < 120.0
+
+
+def test_a_limit_that_is_over_at_once_ends_the_case_alone() -> None:
+    for _ in range(100):
+        with TimeLimit(1e-9) as clock:
+            time.sleep(10.0)
+        assert clock.over
 
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, float("nan")])
