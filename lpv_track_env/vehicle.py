@@ -127,6 +127,8 @@ class VehicleParameters:
                 raise ValueError(
                     f"vehicle {shown(self.name)}: {field.name} must be {wanted}, not {shown(value)}"
                 )
+            if not isinstance(value, str | tuple | list | int | float):  # of NumPy or PyTorch
+                object.__setattr__(self, field.name, float(value))
         check_plausible(vars(self))
         check_computable(vars(self))
 

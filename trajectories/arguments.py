@@ -157,14 +157,19 @@ class Whole:
 
 
 def numbers(name: str, value: Any, rule: Number, count: int) -> tuple[float, ...]:
-    """Return `count` numbers that keep to a rule, from a list, a tuple or a vector.
+    """Return `count` numbers that keep to a rule, from a list, a tuple, a vector or a tensor.
 
     Raises
     ------
     ValueError
         Naming the argument, if there are more or fewer, or one is not within the bounds.
     """
-    given = value.tolist() if isinstance(value, np.ndarray) else value
+    given = value
+    if not isinstance(value, list | tuple):
+        try:
+            given = value.tolist()
+        except Exception:  # noqa: BLE001  methods of a user's object may raise anything
+            given = None
     if not isinstance(given, list | tuple) or len(given) != count:
         raise ValueError(f"{name} must be {count} numbers, each {rule}, not {shown(value)}")
     return tuple(rule.of(f"{name}[{k}]", one) for k, one in enumerate(given))

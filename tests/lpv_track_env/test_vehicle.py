@@ -4,6 +4,7 @@ import json
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -322,6 +323,12 @@ def test_values_of_wrong_types_are_one_short_line(change: dict[str, object], mes
 
 def test_a_source_may_be_written_on_several_lines() -> None:
     assert M2_MINIBUS.replace(source="A Car,\n  2nd\u00a0edition").source == "A Car, 2nd edition"
+
+
+@pytest.mark.parametrize("mass", [np.float32(3000.0), np.int64(3000), np.array(3000.0)])
+def test_numbers_of_other_packages_become_plain_ones(mass: Any) -> None:
+    car = M2_MINIBUS.replace(mass=mass)
+    assert json.dumps(car.as_dict()) == json.dumps(M2_MINIBUS.replace(mass=3000.0).as_dict())
 
 
 def test_a_pipe_is_no_vehicle(tmp_path: Path) -> None:

@@ -111,6 +111,7 @@ def test_tensors_are_numbers() -> None:
     assert "tensor" in refusal(Number().of, "gain", given[None].repeat(2))
     with pytest.raises(ValueError, match="positions must be numbers"):
         array("positions", torch.tensor([0.5], requires_grad=True))
+    assert numbers("x", torch.tensor([1.0, 2.0]), Number(), 2) == (1.0, 2.0)
 
 
 @pytest.mark.parametrize(
