@@ -249,22 +249,13 @@ class Campaign:
         wait, began = self.rng.uniform(0.0, lasted), time.monotonic()
         running.process.join(wait)
         label = f"{folder.name}, {what} after {wait:.3f} s"
-        if not running.process.is_alive():
+        if (code := self.strike(running, what)) is None:
             # The whole run was slower, for example because the machine was busy.
             self.wholes[name] = min(lasted, time.monotonic() - began), rest[0], rest[1]
             self.seen["ended before"] += 1
             return False
-        pid = running.process.pid
-        if what == "worker":
-            workers = [one for one in _session(pid) if one != pid]
-            for worker in workers[: 1 + self.rng.randrange(2)]:
-                os.kill(worker, signal.SIGKILL)
-            if (code := running.end()) != 0:
-                self.faults.append(f"{label}: ended with {code}")
-        elif what == "group":
-            os.killpg(pid, signal.SIGKILL)
-        else:
-            os.kill(pid, signal.SIGKILL)
+        if what == "worker" and code != 0:
+            self.faults.append(f"{label}: ended with {code}")
         running.process.join()
         self.seen[f"{name} {what}"] += 1
         if running.left():
@@ -277,6 +268,24 @@ class Campaign:
         except Exception as error:  # noqa: BLE001  a folder that cannot be read is a fault
             self.faults.append(f"{label}: {type(error).__name__}: {error}")
         return True
+
+    def strike(self, running: Running, what: str) -> int | None:
+        """Kill a job, or one or two of its workers; return how it ended, None if it had before."""
+        pid = running.process.pid
+        assert pid is not None
+        try:
+            if not running.process.is_alive():
+                return None
+            if what == "worker":
+                workers = [one for one in _session(pid) if one != pid]
+                for worker in workers[: 1 + self.rng.randrange(2)]:
+                    os.kill(worker, signal.SIGKILL)
+                return running.end()
+            (os.killpg if what == "group" else os.kill)(pid, signal.SIGKILL)
+        except ProcessLookupError:  # It ended between the look and the kill.
+            running.process.join()
+            return None
+        return -signal.SIGKILL
 
     def finish(self, name: str, folder: Path) -> None:
         """Let a job finish, and compare it with one that was never killed."""
