@@ -51,14 +51,15 @@ def read_bytes(file: str | Path, limit: int = MOST_BYTES) -> bytes:
         with open(file, "rb", opener=_opened) as handle:
             status = os.fstat(handle.fileno())
             regular = stat.S_ISREG(status.st_mode)
-            content = handle.read(limit + 1) if regular else b""
+            # A file may grow meanwhile; memory for all that is allowed is not reserved.
+            size = min(status.st_size, limit)
+            content = handle.read(size + 1) if regular else b""
     except (OSError, ValueError) as error:  # ValueError: the name holds a NUL or half a surrogate
         reason = getattr(error, "strerror", None) or shortened(error)
         raise ValueError(f"{name}: cannot be read: {reason}") from error
     if not regular:
         raise ValueError(f"{name}: cannot be read: it is a pipe or device, no regular file")
-    if len(content) > limit:
-        size = max(status.st_size, len(content))
+    if (size := max(status.st_size, len(content))) > limit:
         raise ValueError(f"{name}: {size} bytes are too many: at most {limit} are read")
     return content
 

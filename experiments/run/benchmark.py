@@ -21,7 +21,7 @@ from rich.progress import (
 from experiments.run import engines
 from experiments.run.case import BaseCase, Case, failed_case, run_case
 from experiments.run.engines import Interrupts
-from experiments.run.folder_lock import locked
+from experiments.run.folder_lock import TRACES, locked
 from experiments.run.provenance import version_changes
 from experiments.run.store import ResultStore
 from experiments.run.tables import path_name
@@ -72,7 +72,7 @@ def run_benchmark(
         Class of the cases.
     limit
         Time limit of a case, s: one that takes longer has failed. With one worker, an agent that
-        never returns from native code is not ended, see `experiments.run.engines.TimeLimit`.
+        never returns from native code is not ended, see `experiments.run.time_limit.TimeLimit`.
 
     Raises
     ------
@@ -92,6 +92,8 @@ def run_benchmark(
         by_id[failed_case(spec, "", kind)["id"]] = case.as_dict()
     with locked(folder):
         store = ResultStore(folder)
+        if (folder / TRACES).is_symlink():
+            raise ValueError(f"{folder / TRACES} is a link: results are written into {folder} only")
         skipped: list[str] = []
         held = store.cases(skipped)
         if (held or skipped) and not resume:

@@ -265,6 +265,12 @@ class Case(BaseCase):
             driven = rollout(env, agent, seed=self.seed, computing_time=computing)
             car = env.unwrapped.vehicle  # type: ignore[attr-defined]
             env.close()
+        for warning in caught:
+            # Of the machine, not of the result, such as damaged code on disk.
+            if issubclass(warning.category, RuntimeWarning):
+                warnings.showwarning(
+                    warning.message, warning.category, warning.filename, warning.lineno
+                )
         measured = metrics.evaluate(driven.trace, driven.path, car)
         if bad := sorted(name for name, value in measured.items() if not np.isfinite(value)):
             raise ValueError(f"metrics not finite: {', '.join(bad)}")

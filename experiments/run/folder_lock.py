@@ -13,10 +13,10 @@ try:
 except ImportError:  # Windows has no such locks: two writers in one folder are not refused there
     fcntl = None  # type: ignore[assignment]
 
-LOCK = ".lock"
+LOCK, TRACES = ".lock", "traces"
 UNLOCKED = ("report.html", "training.png")
 """Files that are also written without the lock, so that a report can be made during a sweep."""
-PLACES = (".", "traces", "judged/*")
+PLACES = (".", TRACES, "judged/*")
 """Folders within a folder that only the holder of its lock writes in."""
 LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.tmp")
 """Names of the temporary files of `trajectories.fileio.write_atomically`."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from agents import Agent
 from agents.base import DrivingTask, blind_control
+from experiments.run.time_limit import check_time
 from lpv_track_env.bicycle import STATE_SIZE
 from lpv_track_env.validation import two_numbers
 from trajectories import ReferencePath
@@ -218,6 +219,7 @@ class _Driver:
         began = time.perf_counter()
         action, memory = self._agent.predict(observation, memory, episode_start=start)
         seconds = time.perf_counter() - began
+        check_time()
         if not all(map(math.isfinite, two_numbers(action))):
             self._count += 1
             task = DrivingTask.of(self._env)

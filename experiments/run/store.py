@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.run.folder_lock import TRACES
 from experiments.run.provenance import command_line, manifest_key, provenance
 from experiments.run.result_schema import Case, read_case
 from trajectories.arguments import shortened
@@ -78,7 +79,7 @@ class ResultStore:
         """Store one result: its trace first, then its line, both on disk when this returns."""
         line = {key: value for key, value in result.items() if key != "trace"}
         if result.get("trace"):
-            write_arrays(self.folder / "traces" / f"{result['id']}.npz", result["trace"])
+            write_arrays(self.folder / TRACES / f"{result['id']}.npz", result["trace"])
         self._drop_torn_line()
         with self.cases_file.open("ab") as handle:
             handle.write(json.dumps(line, sort_keys=True, allow_nan=False).encode() + b"\n")
@@ -143,7 +144,7 @@ class ResultStore:
         Arrays hold finite numbers.
         """
         try:
-            trace = read_arrays(self.folder / "traces" / f"{case_id}.npz")
+            trace = read_arrays(self.folder / TRACES / f"{case_id}.npz")
         except ValueError:
             return None
         if not all(array.dtype.kind in "fiu" and _finite(array) for array in trace.values()):

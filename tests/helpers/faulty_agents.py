@@ -5,6 +5,7 @@ import ctypes
 import os
 import sys
 import time
+import warnings
 
 import numba
 import numpy as np
@@ -105,6 +106,23 @@ class Loops(Rolls):
         while True:
             with contextlib.suppress(Exception):
                 time.sleep(0.01)
+
+
+class SwallowsAll(Rolls):
+    """An agent that takes long and catches whatever comes."""
+
+    def predict(self, observation, state=None, *_, **__):
+        with contextlib.suppress(BaseException):
+            time.sleep(0.05)
+        return super().predict(observation, state)
+
+
+class WarnsOfTheMachine(Rolls):
+    """An agent that warns of something that is not of its result."""
+
+    def predict(self, observation, state=None, *_, **__):
+        warnings.warn("the machine is odd", RuntimeWarning, stacklevel=1)
+        return super().predict(observation, state)
 
 
 class Sticks(Rolls):

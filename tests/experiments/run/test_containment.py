@@ -10,9 +10,9 @@ from rich.console import Console
 
 from experiments.run.benchmark import run_benchmark
 from experiments.run.case import run_case
-from experiments.run.engines import TimeLimit
 from experiments.run.result_schema import plain
 from experiments.run.store import ResultStore
+from experiments.run.time_limit import TimeLimit
 from tests.helpers import faulty_agents
 from trajectories import files, load
 
@@ -77,6 +77,29 @@ def test_a_case_that_takes_too_long_is_ended_in_this_process(tmp_path: Path) -> 
     found = swept(tmp_path, ["Loops", "Rolls"], limit=1.5)
     assert found["Loops"]["error"] == "took longer than 1.5 s"
     assert found["Rolls"]["status"] == "ok"
+
+
+def test_an_agent_that_catches_everything_is_ended_too(tmp_path: Path) -> None:
+    found = swept(tmp_path, ["SwallowsAll", "Rolls"], limit=1.0)
+    assert found["SwallowsAll"]["error"] == "took longer than 1 s"
+    assert found["Rolls"]["status"] == "ok"
+
+
+def test_warnings_of_the_machine_are_shown_and_not_stored() -> None:
+    with pytest.warns(RuntimeWarning, match="the machine is odd"):
+        result = run_case(spec("WarnsOfTheMachine"))
+    assert result["status"] == "ok"
+    assert result["warnings"] == []
+
+
+def test_traces_are_not_written_through_a_link(tmp_path: Path) -> None:
+    folder, elsewhere = tmp_path / "results", tmp_path / "elsewhere"
+    for made in (folder, elsewhere):
+        made.mkdir()
+    (folder / "traces").symlink_to(elsewhere, target_is_directory=True)
+    with pytest.raises(ValueError, match="is a link"):
+        swept(folder, ["Rolls"])
+    assert list(elsewhere.iterdir()) == []
 
 
 def test_workers_survive_what_ends_a_process_and_are_killed_in_native_code(tmp_path: Path) -> None:
