@@ -60,6 +60,13 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, "'--' is no value")
         return super()._get_values(action, arg_strings)
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse arguments; refuse unknown ones here, where it is known whose they are."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found, unknown
+
     def error(self, message: str) -> NoReturn:
         """Raise a ValueError, which is one line, in place of the usage and an exit."""
         # As all other messages name an option and what it must be.

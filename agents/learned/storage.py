@@ -2,9 +2,9 @@
 
 The weights have their digest in their name, NAME.DIGEST.safetensors, so new ones never replace
 those that the present NAME.json refers to. First the new weights are written, then NAME.json is
-replaced, and at last what nobody refers to any more is removed: weights of earlier policies, and
-whatever killed writers have left. Writers of one folder wait for each other; where it cannot be
-locked, nothing is removed.
+replaced, and at last the weights of earlier policies of this NAME are removed, with whatever killed
+writers have left; so copy a policy with both of its files into another folder, not within one.
+Writers of one folder wait for each other; where it cannot be locked, nothing is removed.
 """
 
 import hashlib
