@@ -209,9 +209,9 @@ def test_a_wrong_action_is_one_line_and_moves_nothing(case: str) -> None:
     [
         ({"directions": "both"}, "unknown directions 'both'"),
         ({"span": 1.0}, "span must be above 1"),
-        ({"span": math.nan}, "span must be finite"),
+        ({"span": math.nan}, "span must be a finite number"),
         ({"window": 0.0}, r"window must be in \(0, 1e\+09\] s, not 0.0"),
-        ({"window": math.inf}, "window must be finite"),
+        ({"window": math.inf}, "window must be a finite number"),
     ],
 )
 def test_wrong_choices(wrong: dict[str, Any], message: str) -> None:
