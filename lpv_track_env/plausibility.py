@@ -44,7 +44,7 @@ PLAUSIBLE: Mapping[str, Range] = {
 STIFFNESS_PER_LOAD = (1.0, 100.0)
 """1/rad, of an axle's cornering stiffness and its static load; tyres of cars have 5 to 30."""
 INERTIA_RATIO = (0.1, 10.0)
-"""Of the yaw inertia and m lf lr; cars have about 1."""
+"""Ratio of the yaw inertia to m lf lr; cars have about 1."""
 STIFFNESSES = (("N/deg", 1.0 / DEGREE), ("kN/rad", 1e3), ("kN/deg", 1e3 / DEGREE))
 
 COMPUTABLE = (1e-9, 1e9)

@@ -106,7 +106,7 @@ class Times(TypedDict, total=False):
 
 
 class Driven(TypedDict, total=False):
-    """What a case on a path that has not failed holds beside the entries of `Stored`."""
+    """Entries of a case that drove a path, beside those of `Stored`."""
 
     trajectory: Required[Name]
     metrics: Required[Errors]

@@ -1,4 +1,4 @@
-"""What `predict` is given: absurd numbers, wrong types, memories of others, and NaN in return."""
+"""Inputs of `predict`: absurd numbers, wrong types, memories of others, and NaN in return."""
 
 import functools
 import warnings

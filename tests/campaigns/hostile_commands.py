@@ -150,7 +150,7 @@ AROUND: dict[str, dict[str, Any]] = {
     "nothing in the environment": {"env": dict.fromkeys(os.environ)},
     "threads": {"env": {"OMP_NUM_THREADS": "abc"}},
 }
-"""What a process finds around it."""
+"""Environment variables and streams of a process."""
 
 
 class Try(NamedTuple):

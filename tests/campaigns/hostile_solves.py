@@ -32,7 +32,7 @@ SECONDS = {"lpv-nmpc-ipopt": 25.0}
 """Longest time for a row, s; IPOPT's own limit is 20 s."""
 USUAL_SECONDS = 2.0
 IPOPT_SHARE = 500
-"""Of so many rows in all, one is for IPOPT."""
+"""Number of rows in all for each row that IPOPT gets."""
 VALUES = {
     "1e154": (1e154, -1e154),
     "1e300": (1e300, -1e300),
