@@ -4,6 +4,7 @@ Folders and files that compile more than the environment's kernels, train, start
 are slow as a whole. In other files, slow tests are marked one by one.
 """
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,11 @@ SLOW = (
     "trajectories/test_compilation", "trajectories/test_disk_cache",
 )  # fmt: skip
 """Beginnings of paths below this folder."""
+
+
+def pytest_configure() -> None:
+    # Whoever is started in the background ignores Ctrl-C, and so do the processes it starts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

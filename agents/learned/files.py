@@ -178,14 +178,23 @@ def read_files(kind: Kind, file: Path) -> tuple[Spec, Tensors]:
 
     A writer may replace both in between: then they are read again.
     """
-    spec = read_spec(kind, file)
     while True:
+        before = _identity(file)
+        spec = read_spec(kind, file)
         try:
             return spec, read_tensors(kind, file, spec)
         except ValueError:
-            before, spec = spec, read_spec(kind, file)
-            if spec == before:
+            if _identity(file) == before:
                 raise
+
+
+def _identity(file: Path) -> tuple[int, ...]:
+    """Return numbers that change whenever a file is replaced; () if there is none."""
+    try:
+        status = file.stat()
+    except (OSError, ValueError):
+        return ()
+    return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def layer_tensors(layers: tuple[Layer, ...]) -> Tensors:
