@@ -19,7 +19,7 @@ from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.plants import BICYCLE
 from lpv_track_env.task import Task, action_space
 from lpv_track_env.vector_kernels import ConditionArrays, EnvArrays, StepArrays
-from trajectories.arguments import Whole
+from trajectories.arguments import Whole, shown
 from trajectories.compilation import entry_point
 from trajectories.naming import choose
 
@@ -111,9 +111,10 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         threads: int = 1,
     ) -> None:
         self.num_envs = NUM_ENVS.of("num_envs", num_envs)
-        if (plant := settings["plant"]) != BICYCLE:
-            raise ValueError(
-                f"the compiled vector environment drives plant={BICYCLE!r} only, not {plant!r}: "
+        plant = settings["plant"]
+        if not isinstance(plant, str) or plant != BICYCLE:
+            raise ValueError(  # noqa: TRY004
+                f"the compiled vector environment drives plant={BICYCLE!r} only, not {shown(plant)}: "
                 "make_vec with vectorization_mode='sync' or 'async' takes every plant"
             )
         self.render_mode = settings["render_mode"]

@@ -518,3 +518,20 @@ def test_a_case_takes_a_plant(capsys: pytest.CaptureFixture[str]) -> None:
     assert "nearest: drift" in capsys.readouterr().err
     assert main([*command, "--env", "plant=drift"]) == 2
     assert "no parameters for vehicle 'm2-minibus'" in capsys.readouterr().err
+
+
+class _Refuses:
+    """An object that cannot be compared or shown."""
+
+    __hash__ = None
+
+    def __eq__(self, _other: object) -> bool:
+        raise RuntimeError("__eq__")
+
+    def __repr__(self) -> str:
+        raise RecursionError("deep")
+
+
+def test_the_vector_environment_refuses_a_plant_that_cannot_be_shown() -> None:
+    with pytest.raises(ValueError, match="drives plant='bicycle' only, not <_Refuses"):
+        PathTrackingVectorEnv(1, trajectory="straight", plant=_Refuses())  # type: ignore[arg-type]
