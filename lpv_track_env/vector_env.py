@@ -113,9 +113,9 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         self.num_envs = NUM_ENVS.of("num_envs", num_envs)
         plant = settings["plant"]
         if not isinstance(plant, str) or plant != BICYCLE:
-            raise ValueError(  # noqa: TRY004
-                f"the compiled vector environment drives plant={BICYCLE!r} only, not {shown(plant)}: "
-                "make_vec with vectorization_mode='sync' or 'async' takes every plant"
+            raise ValueError(
+                f"the compiled vector environment drives plant={BICYCLE!r} only, not "
+                f"{shown(plant)}: make_vec with vectorization_mode='sync' or 'async' takes every plant"
             )
         self.render_mode = settings["render_mode"]
         if self.render_mode is not None:
