@@ -115,7 +115,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         if not isinstance(plant, str) or plant != BICYCLE:
             raise ValueError(
                 f"the compiled vector environment drives plant={BICYCLE!r} only, not "
-                f"{shown(plant)}: make_vec with vectorization_mode='sync' or 'async' takes every plant"
+                f"{shown(plant)}: make_vec with vectorization_mode='sync' or 'async' takes every "
+                "plant"
             )
         self.render_mode = settings["render_mode"]
         if self.render_mode is not None:
