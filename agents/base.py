@@ -245,7 +245,7 @@ class TrackingAgent(ABC, Generic[Memory]):
     def diagnostics(self, memory: Memory) -> dict[str, Any]:  # noqa: ARG002  for subclasses
         """Return details of the last step for one vehicle; empty if there are none.
 
-        Known entries: status, seconds, iterations, cost, slack (3,), fallback, weights (10,) Q, S,
+        Known entries: status, seconds, iterations, cost, slack (3,), fallback, weights (12,) Q, S,
         R in use, plan (N + 1, 2) of predicted positions in the frame of the path's foot point.
         """
         return {}

@@ -25,9 +25,9 @@ NODE = 5
 
 
 class LocalReference(NamedTuple):
-    """Reference at K + 1 nodes, one preview period apart; node 0 is the foot point.
+    """Reference at n + 1 nodes, by default a preview period apart; node 0 is the foot point.
 
-    Each field has the shape (..., K + 1), with the batch dimensions of the observation in front.
+    Each field has the shape (..., n + 1), with the batch dimensions of the observation in front.
     """
 
     arc_length: Array
@@ -63,8 +63,10 @@ class Turn(NamedTuple):
     """Direction of travel of the rear axle minus heading, rad."""
 
 
-def local_reference(observation: TrackingObservation, period: float) -> LocalReference:
-    """Reconstruct the nodes of the reference from the preview of an observation.
+def local_reference(
+    observation: TrackingObservation, period: float, lengths: Array | None = None
+) -> LocalReference:
+    """Reconstruct nodes of the reference from the preview of an observation.
 
     Each interval has constant acceleration, so its length is the mean of its end speeds times the
     period; and constant curvature, so it is an arc: the chord is length * sinc(turn / 2) long and
@@ -76,14 +78,17 @@ def local_reference(observation: TrackingObservation, period: float) -> LocalRef
         Scalars shaped (...), previews (..., K).
     period
         Spacing of the preview in the reference's time, s (`ObservationLayout.preview_period`).
+    lengths
+        Time from each node to the next, (n,) s; by default the preview's K periods.
     """
     curvature = np.asarray(observation.preview_curvature, dtype=np.float64)
     rows = curvature.reshape(-1, curvature.shape[-1])
     first = np.asarray(observation.reference_speed, dtype=np.float64).reshape(-1)
     speed = np.asarray(observation.preview_speed, dtype=np.float64).reshape(rows.shape)
-    nodes = np.empty((rows.shape[0], rows.shape[1] + 1, NODE))
-    _fill_rows(rows, first, speed, period, nodes)
-    shaped = nodes.reshape(*curvature.shape[:-1], rows.shape[1] + 1, NODE)
+    lengths = np.full(rows.shape[1], period) if lengths is None else lengths
+    nodes = np.empty((rows.shape[0], len(lengths) + 1, NODE))
+    _fill_rows(rows, first, speed, period, lengths, nodes)
+    shaped = nodes.reshape(*curvature.shape[:-1], len(lengths) + 1, NODE)
     return LocalReference(
         arc_length=shaped[..., NODE_ARC_LENGTH],
         x=shaped[..., NODE_X],
@@ -119,12 +124,52 @@ def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, no
         nodes[k + 1, NODE_X], nodes[k + 1, NODE_Y], nodes[k + 1, NODE_ARC_LENGTH] = x, y, s
 
 
+@compiled_internal
+def fill_nodes_at(
+    curvature: Array, first_speed: Any, speed: Array, period: Any, lengths: Array, nodes: Array
+) -> None:
+    """Fill nodes (n + 1, NODE) that are `lengths` (n,) s apart, from the intervals of one preview.
+
+    Within an interval of `period` s acceleration and curvature are constant, as in `fill_nodes`.
+    Beyond the last interval the reference goes on along it, at its end speed.
+    """
+    s = x = y = heading = 0.0
+    c, d = 1.0, 0.0
+    v, at, left, last = first_speed, 0, period, curvature.shape[0] - 1
+    nodes[0, NODE_SPEED], nodes[0, NODE_HEADING], nodes[0, NODE_X] = first_speed, 0.0, 0.0
+    nodes[0, NODE_Y], nodes[0, NODE_ARC_LENGTH] = 0.0, 0.0
+    for k in range(nodes.shape[0] - 1):
+        rest = lengths[k]
+        while rest > 1e-9:
+            interval = min(at, last)
+            step, after = left, float(speed[interval])
+            if rest < left - 1e-9:
+                step, after = rest, v + (after - v) * (rest / left)
+            if at > last:
+                step, after = rest, v
+            length = 0.5 * (v + after) * step
+            half = 0.5 * curvature[interval] * length
+            ch, sh = math.cos(half), math.sin(half)
+            chord = length if abs(half) < 1e-9 else length * sh / half
+            c, d = c * ch - d * sh, d * ch + c * sh
+            s += length
+            x += chord * c
+            y += chord * d
+            heading += 2.0 * half
+            c, d = c * ch - d * sh, d * ch + c * sh
+            v, rest, left = after, rest - step, left - step
+            if left <= 1e-9:
+                at, left = at + 1, period
+        nodes[k + 1, NODE_SPEED], nodes[k + 1, NODE_HEADING] = v, heading
+        nodes[k + 1, NODE_X], nodes[k + 1, NODE_Y], nodes[k + 1, NODE_ARC_LENGTH] = x, y, s
+
+
 @compiled
 def _fill_rows(
-    curvature: Array, first_speed: Array, speed: Array, period: Any, nodes: Array
+    curvature: Array, first_speed: Array, speed: Array, period: Any, lengths: Array, nodes: Array
 ) -> None:
     for row in range(nodes.shape[0]):
-        fill_nodes(curvature[row], first_speed[row], speed[row], period, nodes[row])
+        fill_nodes_at(curvature[row], first_speed[row], speed[row], period, lengths, nodes[row])
 
 
 def point_at(

@@ -21,15 +21,19 @@ Array = NDArray[np.float64]
 
 LOWEST, HIGHEST = 1e-4, 1e6
 """Bounds of every weight that the NMPC uses."""
-FORMAT = "weight-schedule/2"
+WEIGHTS = 12
+"""Size of a set of weights: Q, S, R, R_rate."""
+FORMAT = "weight-schedule/3"
 """Format of a schedule's file."""
-WITHOUT_SLEW = "weight-schedule/1"
-"""Earlier format, without a slew limit, which is still read."""
+EARLIER = ("weight-schedule/1", "weight-schedule/2")
+"""Earlier formats, without R_rate, the first also without a slew limit, which are still read."""
 
 
 @dataclass(frozen=True)
 class TrackingWeights:
-    """Diagonals of the cost's Q (stage) and S (terminal) on [vx, psi, X, Y], and R on [a, delta].
+    """Diagonals of the cost: Q (stage) and S (terminal) on [vx, psi, X, Y], R and R_rate on inputs.
+
+    R weighs [a, delta], R_rate their rates [jerk, steering rate]; `agents.nmpc.problem` has units.
 
     Only their ratios affect the plan. The defaults track all six trajectories within centimetres.
     Heading has a tenth of the weight of position: a car drives through a bend with sideslip, so a
@@ -44,24 +48,25 @@ class TrackingWeights:
     Q: tuple[float, float, float, float] = (1.0, 1.0, 10.0, 10.0)
     S: tuple[float, float, float, float] = (5.0, 5.0, 50.0, 50.0)
     R: tuple[float, float] = (0.01, 1.0)
+    R_rate: tuple[float, float] = (0.001, 0.1)
 
     def __post_init__(self) -> None:
-        for name, size in (("Q", 4), ("S", 4), ("R", 2)):
+        for name, size in (("Q", 4), ("S", 4), ("R", 2), ("R_rate", 2)):
             values = numbers(name, getattr(self, name), Number(0.0), size)
             object.__setattr__(self, name, values)
 
     def as_array(self) -> Array:
-        """Return Q, S, R in one vector, (10,)."""
-        return np.array([*self.Q, *self.S, *self.R])
+        """Return Q, S, R, R_rate in one vector, (12,)."""
+        return np.array([*self.Q, *self.S, *self.R, *self.R_rate])
 
     @classmethod
     def from_array(cls, values: ArrayLike) -> "TrackingWeights":
-        """Make weights of a vector (10,): the inverse of `as_array`."""
+        """Make weights of a vector (12,): the inverse of `as_array`."""
         array = numbers_of("weights", values)
-        if array.shape != (10,):
-            raise ValueError(f"10 weights are needed, not shape {array.shape}")
+        if array.shape != (WEIGHTS,):
+            raise ValueError(f"{WEIGHTS} weights are needed, not shape {array.shape}")
         flat = array.tolist()
-        return cls(tuple(flat[:4]), tuple(flat[4:8]), tuple(flat[8:]))
+        return cls(tuple(flat[:4]), tuple(flat[4:8]), tuple(flat[8:10]), tuple(flat[10:]))
 
     def clipped(self) -> "TrackingWeights":
         """Return the weights clipped to [LOWEST, HIGHEST]."""
@@ -142,16 +147,17 @@ class WeightSchedule:
             In one line, for anything else.
         """
         try:
-            if content.get("format") not in (FORMAT, WITHOUT_SLEW):
+            if content.get("format") not in (FORMAT, *EARLIER):
                 raise ValueError(f"format is {shown(content.get('format'))}, not {FORMAT!r}")
             bands, slew = content["bands"], content.get("slew")
+            absent = {} if content["format"] == FORMAT else {"R_rate": (0.0, 0.0)}
             return cls(
                 CurvatureBands(
                     thresholds=tuple(float(edge) for edge in bands["thresholds"]),
                     names=tuple(str(name) for name in bands["names"]),
                     hysteresis=float(bands["hysteresis"]),
                 ),
-                tuple(TrackingWeights(**weights) for weights in content["weights"]),
+                tuple(TrackingWeights(**{**absent, **one}) for one in content["weights"]),
                 float(content["blend"]),
                 None if slew is None else float(slew),
                 dict(content["provenance"]),
@@ -190,8 +196,8 @@ def weights_from(value: object) -> TrackingWeights | WeightSchedule:
     Parameters
     ----------
     value
-        Weights, a schedule, or the path of a schedule's .json; or a mapping: Q, S and R, or a
-        schedule as in its file. Entries left out of a mapping have their defaults.
+        Weights, a schedule, or the path of a schedule's .json; or a mapping: Q, S, R and R_rate, or
+        a schedule as in its file. Entries left out of a mapping have their defaults.
 
     Raises
     ------
@@ -212,18 +218,18 @@ def weights_from(value: object) -> TrackingWeights | WeightSchedule:
             defaults = {"format": FORMAT, "blend": 0.0, "provenance": {}}
             return WeightSchedule.from_dict({**defaults, **value, "bands": bands})
         for name in value:
-            choose("matrix of weights", name, ("Q", "S", "R"))
+            choose("matrix of weights", name, ("Q", "S", "R", "R_rate"))
         return TrackingWeights(**value)
     except (ValueError, TypeError) as error:
         raise ValueError(f"weights: {' '.join(str(error).split())}") from error
 
 
 def in_words(weights: ArrayLike) -> dict[str, str]:
-    """Format weights (10,) with two digits, for a picture: a text each for Q, S and R."""
-    q, s, r = np.split(np.asarray(weights, dtype=np.float64), (4, 8))
+    """Format weights (12,) with two digits, for a picture: a text for each matrix."""
+    parts = np.split(np.asarray(weights, dtype=np.float64), (4, 8, 10))
     return {
         label: "   ".join(_two_digits(value) for value in values.tolist())
-        for label, values in (("Q", q), ("S", s), ("R", r))
+        for label, values in zip(("Q", "S", "R", "R_rate"), parts, strict=True)
     }
 
 

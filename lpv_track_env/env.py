@@ -17,7 +17,7 @@ from lpv_track_env.conditions import load as load_conditions
 from lpv_track_env.conditions.layout import ConditionedVehicle, info_of
 from lpv_track_env.draws import random_key
 from lpv_track_env.episodes import single_info
-from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.observation import PREVIEW_PERIOD, PREVIEW_STEPS, ObservationLayout
 from lpv_track_env.plants import PlantEpisode
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.task import Task, action_space, checked_period, reference
@@ -130,7 +130,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     control_period
         s; the dynamics are integrated with fixed Runge-Kutta steps of at most 5 ms within it.
     preview_steps, preview_period
-        K and the spacing of the preview, s (by default the control period).
+        K and the spacing of the preview, s.
     reward_weights
         `lpv_track_env.reward.RewardWeights`.
     max_lateral_error
@@ -167,8 +167,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         control_period: float = 0.05,
         render_mode: str | None = None,
         *,
-        preview_steps: int = 20,
-        preview_period: float | None = None,
+        preview_steps: int = PREVIEW_STEPS,
+        preview_period: float = PREVIEW_PERIOD,
         reward_weights: RewardWeights | None = None,
         max_lateral_error: float = 5.0,
         time_limit: float | None = None,
@@ -189,9 +189,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             path=reference(trajectory, car, speed_mode, fixed_speed),
             vehicle=car,
             control_period=period,
-            layout=ObservationLayout(
-                preview_steps, period if preview_period is None else preview_period
-            ),
+            layout=ObservationLayout(preview_steps, preview_period),
             reward_weights=RewardWeights() if reward_weights is None else reward_weights,
             max_lateral_error=max_lateral_error,
             time_limit=time_limit,

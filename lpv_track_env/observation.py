@@ -77,6 +77,8 @@ class TrackingObservation(NamedTuple):
     preview_speed: Array
 
 
+PREVIEW_STEPS, PREVIEW_PERIOD = 20, 0.1
+"""Preview by default, whatever the control period: two seconds (s between nodes)."""
 MOST_STEPS = 1000
 """Largest number of preview nodes; every step of an environment computes all of them."""
 RULES: dict[str, Number | Whole] = {
@@ -103,8 +105,8 @@ class ObservationLayout:
         range.
     """
 
-    preview_steps: int = 20
-    preview_period: float = 0.05
+    preview_steps: int = PREVIEW_STEPS
+    preview_period: float = PREVIEW_PERIOD
 
     def __post_init__(self) -> None:
         check_fields(self, RULES)

@@ -1,5 +1,6 @@
 """Common base of the NMPC agents: settings, weights, fallback after failed solves."""
 
+import math
 from abc import ABC
 from collections import Counter
 from collections.abc import Mapping
@@ -12,13 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.base import DrivingTask, TrackingAgent, blind_control
 from agents.classical.geometric import Stanley
-from agents.nmpc.problem import HORIZON, NmpcProblem
+from agents.nmpc.problem import HORIZON, PERIOD, NmpcProblem
 from agents.nmpc.schedule import Switching
 from agents.reference import local_reference
 from agents.weights import TrackingWeights, WeightSchedule, weights_from
-from lpv_track_env.observation import TrackingObservation
+from lpv_track_env.observation import ObservationLayout, TrackingObservation
 from lpv_track_env.vehicle import VehicleParameters
-from trajectories.arguments import Whole, check_fields, instance_of, shown
+from trajectories.arguments import Whole, check_fields, instance_of, numbers, shown
 
 Array = NDArray[np.float64]
 Memory = TypeVar("Memory")
@@ -33,11 +34,13 @@ class NmpcSettings:
     Parameters
     ----------
     horizon
-        Horizon N, at most the preview steps of the observation (the default).
+        Number of stages N; by default the stages end with the observation's preview.
+    stages
+        Lengths of the stages, s: one number for all, or (N,). The default is the preview's period.
     weights
         Fixed weights, a schedule, or the file of a schedule. Either may be given as a mapping, too:
-        `{"Q": [4 numbers], "S": [4], "R": [2]}`, or a schedule in the form of its file. Once the
-        settings are made, these are `TrackingWeights` or a `WeightSchedule`.
+        `{"Q": [4 numbers], "S": [4], "R": [2], "R_rate": [2]}`, or a schedule in the form of its
+        file. Once the settings are made, these are `TrackingWeights` or a `WeightSchedule`.
     selection
         Rule by which a schedule chooses: "band" from the sharpest curvature in the preview at every
         step, or "path" once from the path's sharpest curvature, the paper's rule.
@@ -55,6 +58,7 @@ class NmpcSettings:
     """
 
     horizon: int | None = None
+    stages: float | tuple[float, ...] | None = None
     weights: TrackingWeights | WeightSchedule | Mapping[str, Any] | str | Path | None = None
     selection: str = "band"
     model: VehicleParameters | None = None
@@ -67,6 +71,11 @@ class NmpcSettings:
             raise ValueError(f"selection must be 'band' or 'path', not {shown(self.selection)}")
         if self.horizon is not None:
             check_fields(self, {"horizon": HORIZON})
+        if isinstance(self.stages, list | tuple | np.ndarray):
+            size = len(self.stages) if self.horizon is None else self.horizon
+            object.__setattr__(self, "stages", numbers("stages", self.stages, PERIOD, size))
+        elif self.stages is not None:
+            check_fields(self, {"stages": PERIOD})
         if self.model is not None:
             instance_of("model", self.model, VehicleParameters, "VehicleParameters or None")
         check_fields(self, {"max_failures": FAILURES})
@@ -84,6 +93,29 @@ class Fallback:
     """Replacement in the last step: "plan", "stanley" or "stop", "" if the solve succeeded."""
     counts: Counter[str] = field(default_factory=Counter)
     """Failed solves by status, and replacements by name, in this episode."""
+
+
+def stages_of(settings: NmpcSettings, layout: ObservationLayout) -> tuple[float, ...]:
+    """Return the lengths of an agent's stages, s, which the preview must cover.
+
+    Raises
+    ------
+    ValueError
+        If the preview is shorter.
+    """
+    period, seen = layout.preview_period, layout.preview_steps * layout.preview_period
+    lengths = period if settings.stages is None else settings.stages
+    if isinstance(lengths, float):
+        horizon = settings.horizon or max(int(seen / lengths + 1e-6), 1)
+        lengths = (lengths,) * horizon
+    if sum(lengths) > seen * (1.0 + 1e-6):
+        steps = math.ceil(sum(lengths) / period - 1e-6)
+        raise ValueError(
+            f"a horizon of {len(lengths)} stages, {sum(lengths):.4g} s, is longer than the preview "
+            f"of {layout.preview_steps} steps of {period:g} s: make the environment with "
+            f"preview_steps={steps}"
+        )
+    return lengths
 
 
 class NmpcAgent(TrackingAgent[Memory], ABC):
@@ -108,17 +140,11 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
 
     def __init__(self, task: DrivingTask, settings: NmpcSettings) -> None:
         super().__init__(task)
-        steps = task.layout.preview_steps
-        horizon = steps if settings.horizon is None else settings.horizon
-        if horizon > steps:
-            raise ValueError(
-                f"horizon {horizon} is longer than the preview of {steps} steps: "
-                f"make the environment with preview_steps={horizon}"
-            )
+        stages = stages_of(settings, task.layout)
         self.problem = NmpcProblem(
             vehicle=settings.model or task.vehicle,
-            horizon=horizon,
-            period=task.layout.preview_period,
+            horizon=len(stages),
+            stages=stages,
             first_period=task.control_period,
             linear_penalty=settings.linear_penalty,
             quadratic_penalty=settings.quadratic_penalty,
@@ -132,7 +158,7 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
         self.switching = Switching(weights, task.control_period)
 
     def set_weights(self, weights: TrackingWeights | ArrayLike) -> bool:
-        """Set weights, (10,) as Q, S, R, from the next step on; the warm start is kept.
+        """Set weights, (12,) as Q, S, R, R_rate, from the next step on; the warm start is kept.
 
         They replace a schedule, too. Values out of bounds are clipped. A vector that is not finite,
         negative or of the wrong size is rejected: the weights stay as they are, `rejected_weights`
@@ -158,7 +184,7 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
 
     @property
     def fixed_weights(self) -> Array:
-        """Q, S, R in use without a schedule, (1, 10)."""
+        """Q, S, R, R_rate in use without a schedule, (1, 12)."""
         weights: Array = self.switching.tables[:, 0]
         return weights
 
@@ -185,9 +211,8 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
              o.lateral_error]
         )  # fmt: skip
         last = np.array([o.acceleration, o.steering_angle]).clip(low, high)
-        nodes = local_reference(o, self.problem.period)
-        stacked = np.stack([nodes.speed, nodes.heading, nodes.x, nodes.y], axis=-1)
-        return state, last, stacked[: self.problem.horizon + 1]
+        nodes = local_reference(o, self.task.layout.preview_period, self.problem.periods)
+        return state, last, np.stack([nodes.speed, nodes.heading, nodes.x, nodes.y], axis=-1)
 
     def replace(
         self,
@@ -222,7 +247,8 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
         finite = all(np.isfinite(entry).all() for entry in observation)
         control = self._stanley.control if finite else self._stanley.control_blind
         a, delta = control(observation, fallback.stanley)
-        stage = int(age * self.task.control_period / self.problem.period + 1e-9)
+        ends = self.problem.times[1:]
+        stage = int(np.searchsorted(ends, age * self.task.control_period + 1e-9, side="right"))
         if failures > self.max_failures:
             fallback.used = "stop"
             a, _ = blind_control(self.task.vehicle, observation)

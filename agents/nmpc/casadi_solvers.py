@@ -13,7 +13,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc.problem import INPUTS, OUTPUTS, SOFT, STATES, NmpcProblem, Solution, Status
+from agents.nmpc.problem import (
+    INPUTS,
+    NOMINAL_PERIOD,
+    OUTPUTS,
+    SOFT,
+    STATES,
+    NmpcProblem,
+    Solution,
+    Status,
+)
+from agents.weights import WEIGHTS
 from lpv_track_env import lpv
 from trajectories.arguments import Number, checks_arguments
 
@@ -61,18 +71,26 @@ def lpv_field(state: Any, action: Any, problem: NmpcProblem) -> Any:
     return ca.mtimes(a_matrix, state) + ca.mtimes(b_matrix, action)
 
 
-def discrete_model(problem: NmpcProblem) -> ca.Function:
-    """Build F(x, u), the state after one period, by Runge-Kutta steps of the LPV form."""
+def discrete_model(problem: NmpcProblem, stage: int = 0) -> ca.Function:
+    """Build F(x, u), the state after a stage, by Runge-Kutta steps of the LPV form."""
     x, u = ca.SX.sym("x", STATES), ca.SX.sym("u", INPUTS)
     field = ca.Function("field", [x, u], [lpv_field(x, u, problem)])
-    h, state = problem.period / problem.substeps, x
-    for _ in range(problem.substeps):
+    substeps = int(problem.substeps[stage])
+    h, state = problem.periods[stage] / substeps, x
+    for _ in range(substeps):
         k1 = field(state, u)
         k2 = field(state + 0.5 * h * k1, u)
         k3 = field(state + 0.5 * h * k2, u)
         k4 = field(state + h * k3, u)
         state = state + h / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
     return ca.Function("F", [x, u], [state])
+
+
+def stage_models(problem: NmpcProblem) -> list[ca.Function]:
+    """Build `discrete_model` of every stage; stages of the same length share theirs."""
+    lengths = problem.periods.tolist()
+    models = {length: discrete_model(problem, i) for i, length in enumerate(lengths)}
+    return [models[length] for length in lengths]
 
 
 class _Nlp:
@@ -82,10 +100,10 @@ class _Nlp:
         self.problem, n = problem, problem.horizon
         self.initial, self.last = ca.SX.sym("x0", STATES), ca.SX.sym("u_last", INPUTS)
         self.reference = ca.SX.sym("reference", OUTPUTS, n + 1)
-        self.weights = ca.SX.sym("weights", 2 * OUTPUTS + INPUTS)
-        self.q, self.s, self.r = ca.vertsplit(
-            self.weights, [0, OUTPUTS, 2 * OUTPUTS, 2 * OUTPUTS + INPUTS]
-        )
+        self.weights = ca.SX.sym("weights", WEIGHTS)
+        q, s, r, rate = np.cumsum([OUTPUTS, OUTPUTS, INPUTS, INPUTS]).tolist()
+        self.q, self.s, self.r, self.r_rate = ca.vertsplit(self.weights, [0, q, s, r, rate])
+        self.shares = problem.periods / NOMINAL_PERIOD
         self.cost: Any = 0
         self.variables: list[Any] = []
         self.lower: list[float] = []
@@ -148,6 +166,14 @@ class _Nlp:
         self.limit(vy - ratio * vx - slack[1], -INFINITY, 0.0)
         self.limit(-vy - ratio * vx - slack[1], -INFINITY, 0.0)
 
+    def add_input_cost(self, i: int, u: Any, before: Any) -> None:
+        """Add the cost of stage i's input u, and of its change from the input before."""
+        spacing = self.problem.spacings[i]
+        self.cost += 0.5 * self.shares[i] * ca.dot(self.r, u**2)
+        self.cost += (
+            0.5 * spacing / NOMINAL_PERIOD * ca.dot(self.r_rate, ((u - before) / spacing) ** 2)
+        )
+
     def error(self, i: int, state: Any) -> Any:
         """Output error at node i."""
         return self.reference[:, i] - ca.mtimes(ca.DM(lpv.C), state)
@@ -175,7 +201,8 @@ class _NlpSolver(ABC):
     """Results of a solve that start the next one, by the name of its argument."""
 
     problem: NmpcProblem
-    _model: ca.Function
+    _models: list[ca.Function]
+    """Discrete model of each stage."""
     _bounds: dict[str, Array]
     _cold_solver: ca.Function
     _warm_solver: ca.Function
@@ -183,7 +210,7 @@ class _NlpSolver(ABC):
     def solve(
         self, state: Array, last_input: Array, reference: Array, weights: Array, warm: Any = None
     ) -> tuple[Solution, Any]:
-        """Solve from `state` (6,), with the input in force (2,) and the weights (10,).
+        """Solve from `state` (6,), with the input in force (2,) and the weights (12,).
 
         `reference` is (N + 1, 4). `warm` is the warm start that the last solve returned, shifted by
         one period here. Never raises: the status reports failures.
@@ -229,8 +256,8 @@ class _NlpSolver(ABC):
         guess = np.zeros((self.problem.horizon, self.GROUP))
         for columns in self.INPUT:
             guess[:, columns] = held
-        for row in guess:
-            row[self.STATE] = state = np.asarray(self._model(state, held)).ravel()
+        for row, model in zip(guess, self._models, strict=True):
+            row[self.STATE] = state = np.asarray(model(state, held)).ravel()
         return (guess if np.isfinite(guess).all() else np.zeros_like(guess)).ravel()
 
     def _shifted(self, warm: dict[str, Array]) -> dict[str, Array]:
@@ -264,7 +291,7 @@ class IpoptSolver(_NlpSolver):
     def __init__(
         self, problem: NmpcProblem, *, tolerance: float = 1e-6, max_seconds: float = 20.0
     ) -> None:
-        self.problem, self._model = problem, discrete_model(problem)
+        self.problem, self._models = problem, stage_models(problem)
         nlp = self._transcribed()
         given = nlp.as_dict()
         self._bounds = {
@@ -296,9 +323,10 @@ class IpoptSolver(_NlpSolver):
             u = nlp.control(f"u{i}", INPUTS, low_u, high_u)
             slack = nlp.control(f"s{i}", SOFT, 0.0, INFINITY)
             following = nlp.state(f"x{i + 1}", STATES)
-            nlp.cost += 0.5 * (ca.dot(nlp.q, nlp.error(i, state) ** 2) + ca.dot(nlp.r, u**2))
-            nlp.cost += ca.dot(linear, slack) + 0.5 * ca.dot(quadratic, slack**2)
-            nlp.gap(self._model(state, u) - following)
+            penalty = ca.dot(linear, slack) + 0.5 * ca.dot(quadratic, slack**2)
+            nlp.cost += nlp.shares[i] * (0.5 * ca.dot(nlp.q, nlp.error(i, state) ** 2) + penalty)
+            nlp.add_input_cost(i, u, previous)
+            nlp.gap(self._models[i](state, u) - following)
             nlp.limit(u - previous, -steps, steps)
             nlp.limit_rate(state, u, slack[2])
             nlp.limit_velocity(following, slack)
@@ -375,7 +403,7 @@ class FatropSolver(_NlpSolver):
                 "this CasADi was built without fatrop: say solver='ipopt', or install its wheel "
                 "from PyPI"
             )
-        self.problem, self._model = problem, discrete_model(problem)
+        self.problem, self._models = problem, stage_models(problem)
         nlp = self._transcribed()
         states, controls, rows = (list(sizes) for sizes in zip(*nlp.sizes, strict=True))
         options: dict[str, Any] = {
@@ -411,17 +439,19 @@ class FatropSolver(_NlpSolver):
         for i in range(n + 1):
             nlp.begin(0 if i == 0 else STATES + INPUTS)
             here = x
-            nlp.cost += 0.5 * ca.dot(nlp.q if i < n else nlp.s, nlp.error(i, here) ** 2)
+            squared = nlp.error(i, here) ** 2
+            nlp.cost += 0.5 * ca.dot(nlp.shares[i] * nlp.q if i < n else nlp.s, squared)
             if i > 0:
                 sigma = nlp.control(f"sigma{i}", 2, 0.0, INFINITY)
-                nlp.cost += penalty(sigma[0], 0) + penalty(sigma[1], 1)
+                nlp.cost += nlp.shares[i - 1] * (penalty(sigma[0], 0) + penalty(sigma[1], 1))
             if i < n:
                 u = nlp.control(f"u{i}", INPUTS, low_u, high_u)
                 rate_slack = nlp.control(f"s{i}", 1, 0.0, INFINITY)
-                nlp.cost += 0.5 * ca.dot(nlp.r, u**2) + penalty(rate_slack, 2)
+                nlp.cost += nlp.shares[i] * penalty(rate_slack, 2)
+                nlp.add_input_cost(i, u, applied)
                 following = nlp.state(f"x{i + 1}", STATES + INPUTS)
                 # fatrop needs the gap as x_{i+1} - F, and before the stage's other rows.
-                nlp.gap(following - ca.vertcat(self._model(here, u), u))
+                nlp.gap(following - ca.vertcat(self._models[i](here, u), u))
                 nlp.limit(u - applied, -problem.input_steps[i], problem.input_steps[i])
                 nlp.limit_rate(here, u, rate_slack)
                 x, applied = following[:STATES], following[STATES:]

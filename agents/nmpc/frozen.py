@@ -86,9 +86,9 @@ class FrozenLpvSolver:
         states = np.zeros((n + 1, 6))
         rate, rate_x, rate_u = np.zeros(n), np.zeros((n, 6)), np.ones((n, 2))
         states[0] = state
-        for i in range(n):
+        for i, period in enumerate(self.problem.periods):
             a, b, constant = self._continuous(along[i], inputs[i], heading[i])
-            a_all[i], b_all[i], offset = _held(a, b, constant, self.problem.period)
+            a_all[i], b_all[i], offset = _held(a, b, constant, period)
             states[i + 1] = a_all[i] @ states[i] + b_all[i] @ inputs[i] + offset
             rate[i] = a[VX] @ states[i] + b[VX] @ inputs[i]
             rate_x[i], rate_u[i] = a[VX], b[VX]

@@ -6,7 +6,8 @@ the multiplier after a step of length zero, its step is
 
     ds = (sum b - linear - quadratic s - sum w dgap) / (quadratic + sum w)
 
-over its pairs and its own bound. Each stage then adds a Hessian and a gradient to the Riccati
+over its pairs and its own bound, with both penalties multiplied by the stage's share of the nominal
+period. Each stage then adds a Hessian and a gradient to the Riccati
 recursion. Pairs and arrays are described in `layout`.
 """
 
@@ -15,7 +16,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from agents.nmpc import layout as L
-from agents.nmpc.linearisation import RATE_DELTA, RATE_R, RATE_VX, RATE_VY
+from agents.nmpc.linearisation import RATE_A, RATE_DELTA, RATE_R, RATE_VX, RATE_VY
 from trajectories.compilation import compiled_internal
 
 Array = NDArray[Any]
@@ -33,15 +34,17 @@ def initialise(lanes: Array, constants: Array) -> Float:
 
     Returns the largest residual t - gap.
     """
-    worst = 0.0
-    for i in range(lanes.shape[1]):
+    worst, n = 0.0, lanes.shape[1]
+    shares = L.grid(constants, L.SHARE, n)
+    most_a, most_delta = L.grid(constants, L.CHANGE_A, n), L.grid(constants, L.CHANGE_DELTA, n)
+    for i in range(n):
         for k in range(8):
             if k < 2:
                 reach = constants[L.HIGH_A] - constants[L.LOW_A]
             elif k < 4:
                 reach = 2.0 * constants[L.MAX_DELTA]
             else:
-                reach = 2.0 * constants[L.CHANGE_A if k < 6 else L.CHANGE_DELTA]
+                reach = 2.0 * (most_a[i] if k < 6 else most_delta[i])
             gap = lanes[L.GAP + k, i]
             t = max(gap, START_DISTANCE * reach)
             worst = max(worst, t - gap)
@@ -50,7 +53,7 @@ def initialise(lanes: Array, constants: Array) -> Float:
         for soft in range(3):
             first = 8 + 3 * soft
             high, low = lanes[L.GAP + first, i], lanes[L.GAP + first + 1, i]
-            least = START_BARRIER / (constants[L.LINEAR + soft] + 1e-3)
+            least = START_BARRIER / (constants[L.LINEAR + soft] * shares[i] + 1e-3)
             slack = max(-min(high, low), 0.0) + least
             lanes[L.T + first, i], lanes[L.T + first + 1, i] = high + slack, low + slack
             lanes[L.T + first + 2, i] = slack
@@ -68,6 +71,7 @@ def fill_hessian(lanes: Array, constants: Array) -> None:
     large numbers.
     """
     n = lanes.shape[1]
+    shares = L.grid(constants, L.SHARE, n)
     for k in range(L.PAIRS):
         t, lam, correction = lanes[L.T + k], lanes[L.LAM + k], lanes[L.DT + k]
         inverse, weight = lanes[L.INVERSE + k], lanes[L.WEIGHT + k]
@@ -80,15 +84,26 @@ def fill_hessian(lanes: Array, constants: Array) -> None:
     for i in range(n):
         for f in range(4):
             lanes[L.BARRIER_A + f, i] = w[2 * f, i] + w[2 * f + 1, i]
-        w1, w2, w3, quadratic = w[8, i], w[9, i], w[10, i], constants[L.QUADRATIC]
+        w1, w2, w3 = w[8, i], w[9, i], w[10, i]
+        quadratic = constants[L.QUADRATIC] * shares[i]
         bottom = 1.0 / (quadratic + w1 + w2 + w3)
         vx = ((w1 + w2) * (quadratic + w3) + 4.0 * w1 * w2) * bottom
         lanes[L.BOTTOM, i] = bottom
-        w1, w2, w3, quadratic = w[11, i], w[12, i], w[13, i], constants[L.QUADRATIC_RATE]
+        w1, w2, w3, quadratic = (
+            w[11, i],
+            w[12, i],
+            w[13, i],
+            constants[L.QUADRATIC_RATE] * shares[i],
+        )
         bottom = 1.0 / (quadratic + w1 + w2 + w3)
         lanes[L.BARRIER_RATE, i] = ((w1 + w2) * (quadratic + w3) + 4.0 * w1 * w2) * bottom
         lanes[L.BOTTOM_RATE, i] = bottom
-        w1, w2, w3, quadratic = w[14, i], w[15, i], w[16, i], constants[L.QUADRATIC_RATIO]
+        w1, w2, w3, quadratic = (
+            w[14, i],
+            w[15, i],
+            w[16, i],
+            constants[L.QUADRATIC_RATIO] * shares[i],
+        )
         bottom = 1.0 / (quadratic + w1 + w2 + w3)
         apart = (quadratic + w3) * bottom
         lanes[L.BARRIER_VX, i] = vx + ratio * ratio * (w1 + w2) * apart
@@ -101,6 +116,7 @@ def fill_hessian(lanes: Array, constants: Array) -> None:
 def fill_gradient(lanes: Array, constants: Array, share: Float) -> None:
     """Fill the gradient terms of the pairs and of their corrections in the rows of dt."""
     n = lanes.shape[1]
+    shares = L.grid(constants, L.SHARE, n)
     for k in range(L.PAIRS):
         force, correction = lanes[L.FORCE + k], lanes[L.DT + k]
         weight, residual = lanes[L.WEIGHT + k], lanes[L.RESIDUAL + k]
@@ -112,15 +128,18 @@ def fill_gradient(lanes: Array, constants: Array, share: Float) -> None:
         for f in range(4):
             lanes[L.SLOPE_A + f, i] = b[2 * f, i] - b[2 * f + 1, i]
         b1, b2, slack = b[8, i], b[9, i], lanes[L.T + 10, i]
-        top = b1 + b2 + b[10, i] - constants[L.LINEAR] - constants[L.QUADRATIC] * slack
+        top = b1 + b2 + b[10, i]
+        top -= shares[i] * (constants[L.LINEAR] + constants[L.QUADRATIC] * slack)
         vx = b1 - b2 - (w[8, i] - w[9, i]) * top * lanes[L.BOTTOM, i]
         lanes[L.TOP, i] = top
         b1, b2, slack = b[11, i], b[12, i], lanes[L.T + 13, i]
-        top = b1 + b2 + b[13, i] - constants[L.LINEAR_RATE] - constants[L.QUADRATIC_RATE] * slack
+        top = b1 + b2 + b[13, i]
+        top -= shares[i] * (constants[L.LINEAR_RATE] + constants[L.QUADRATIC_RATE] * slack)
         lanes[L.SLOPE_RATE, i] = b1 - b2 - (w[11, i] - w[12, i]) * top * lanes[L.BOTTOM_RATE, i]
         lanes[L.TOP_RATE, i] = top
         b1, b2, slack = b[14, i], b[15, i], lanes[L.T + 16, i]
-        top = b1 + b2 + b[16, i] - constants[L.LINEAR_RATIO] - constants[L.QUADRATIC_RATIO] * slack
+        top = b1 + b2 + b[16, i]
+        top -= shares[i] * (constants[L.LINEAR_RATIO] + constants[L.QUADRATIC_RATIO] * slack)
         taken = top * lanes[L.BOTTOM_RATIO, i]
         right, left = b1 - w[14, i] * taken, b2 - w[15, i] * taken
         lanes[L.SLOPE_VX, i], lanes[L.SLOPE_VY, i] = vx - ratio * (right + left), right - left
@@ -155,7 +174,7 @@ def expand_step(stages: Array, lanes: Array, constants: Array, share: Float) -> 
         slack = (lanes[L.TOP, i] + (w[8, i] - w[9, i]) * vx) * lanes[L.BOTTOM, i]
         dt[8, i], dt[9, i], dt[10, i] = slack - vx, slack + vx, slack
         rate = e[RATE_VX] * e[L.STEP_VX] + e[RATE_VY] * e[L.STEP_VY] + e[RATE_R] * e[L.STEP_R]
-        rate = rate + a + e[RATE_DELTA] * delta
+        rate = rate + e[RATE_A] * a + e[RATE_DELTA] * delta
         slack = (lanes[L.TOP_RATE, i] + (w[11, i] - w[12, i]) * rate) * lanes[L.BOTTOM_RATE, i]
         dt[11, i], dt[12, i], dt[13, i] = slack - rate, slack + rate, slack
         right, left = ratio * vx - vy, ratio * vx + vy

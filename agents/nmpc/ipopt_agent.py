@@ -10,7 +10,8 @@ from agents.base import DrivingTask
 from agents.nmpc.base import Fallback, NmpcAgent, NmpcSettings
 from agents.nmpc.casadi_solvers import FatropSolver, IpoptSolver
 from agents.nmpc.problem import Solution, Status
-from agents.nmpc.schedule import NO_BAND, WEIGHTS
+from agents.nmpc.schedule import NO_BAND
+from agents.weights import WEIGHTS
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.validation import forwards_arguments
 from trajectories.naming import choose

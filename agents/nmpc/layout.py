@@ -1,6 +1,7 @@
 """Layout of the compiled NMPC's arrays. They are few, since each costs compile time.
 
-`constants` (CONSTANTS_SIZE,) are those of a solver: model, discretisation, limits and penalties.
+`constants` are those of a solver: model, discretisation, limits and penalties (CONSTANTS_SIZE),
+then the rows of `grid`, N entries each.
 `stages` (N + 1, STAGE) has a row for each stage, for the recursions: derivatives of the model
 (`linearisation`), gains (`riccati`), three points in the order a, delta, vx, vy, psi, r, X, Y, the
 reference, and one more point. The last stage only has a state.
@@ -17,40 +18,47 @@ on several stages at a time. Every inequality is a pair (t, lam) with t lam -> 0
 import numpy as np
 from numpy.typing import NDArray
 
+from trajectories.compilation import compiled_in_place
+
 Array = NDArray[np.float64]
 
-# Entries of `constants` after the 7 parameters of the model: length (s) and number of Runge-Kutta
-# steps, period, share of a period by which plans are shifted, the QP's tolerance; bounds of the
-# action space; of inputs, of their changes, and of the soft constraints on vx, vx' and |vy| / vx;
-# their linear and quadratic penalties; Levenberg terms.
+# Entries of `constants` after the 7 parameters of the model: fastest lateral pole at 1 m/s by which
+# Runge-Kutta steps are chosen (0: the grid's), spacing of the preview, the QP's tolerance; bounds
+# of the action space; of inputs, and of the soft constraints on vx, vx' and |vy| / vx; their linear
+# and quadratic penalties; Levenberg terms.
 (
-    SUBSTEP, SUBSTEPS, PERIOD, SHIFT, TOLERANCE,
+    POLE, PREVIEW_PERIOD, TOLERANCE,
     SPACE_LOW_A, SPACE_LOW_DELTA, SPACE_HIGH_A, SPACE_HIGH_DELTA,
-    LOW_A, HIGH_A, MAX_DELTA, CHANGE_A, CHANGE_DELTA, FIRST_CHANGE_A, FIRST_CHANGE_DELTA,
+    LOW_A, HIGH_A, MAX_DELTA,
     LOW_SPEED, HIGH_SPEED, LOW_RATE, HIGH_RATE, RATIO,
     LINEAR, LINEAR_RATE, LINEAR_RATIO, QUADRATIC, QUADRATIC_RATE, QUADRATIC_RATIO,
     DAMPING_A, DAMPING_DELTA,
-) = range(7, 36)  # fmt: skip
-CONSTANTS_SIZE = 36
+) = range(7, 30)  # fmt: skip
+CONSTANTS_SIZE = 30
+# Rows of `grid`, an entry a stage: its length (s), Runge-Kutta steps, length by the nominal period,
+# weight of a squared change of input by that of a squared rate, largest changes of a and delta,
+# share of the way to the next stage's input by which a plan is shifted.
+LENGTH, SUBSTEPS, SHARE, SMOOTH, CHANGE_A, CHANGE_DELTA, SHIFT = range(7)
+GRID = 7
 SLACK_OF = (0, 2, 1)
 """Index of each soft constraint, in the order of this module, among the problem's (vx, vy, vx')."""
 
 # Entries of a stage: derivatives; feedback K (2, 6), M^-1 W (2, 2), M^-1 (3), W (2);
-DERIVATIVES = 37
+DERIVATIVES = 38
 GAIN_A, GAIN_DELTA, CARRY, INVERSE_AA, INVERSE_AD, INVERSE_DD, HOLD_A, HOLD_DELTA = (
-    37, 43, 49, 53, 54, 55, 56, 57,
+    38, 44, 50, 54, 55, 56, 57, 58,
 )  # fmt: skip
 # the Newton step, the solution so far, the plan of the linearisation, POINT entries each;
-STEP_A, STEP_DELTA, STEP_VX, STEP_VY, STEP_PSI, STEP_R, STEP_X, STEP_Y = range(58, 66)
-NOW_A, NOW_DELTA, NOW_VX, NOW_VY, NOW_PSI, NOW_R, NOW_X, NOW_Y = range(66, 74)
-PLAN_A, PLAN_DELTA, PLAN_VX, PLAN_VY, PLAN_PSI, PLAN_R, PLAN_X, PLAN_Y = range(74, 82)
+STEP_A, STEP_DELTA, STEP_VX, STEP_VY, STEP_PSI, STEP_R, STEP_X, STEP_Y = range(59, 67)
+NOW_A, NOW_DELTA, NOW_VX, NOW_VY, NOW_PSI, NOW_R, NOW_X, NOW_Y = range(67, 75)
+PLAN_A, PLAN_DELTA, PLAN_VX, PLAN_VY, PLAN_PSI, PLAN_R, PLAN_X, PLAN_Y = range(75, 83)
 POINT = 8
 # the reference, a node of `agents.reference`, whose first four entries are used;
-REFERENCE, REFERENCE_HEADING, REFERENCE_X, REFERENCE_Y = range(82, 86)
+REFERENCE, REFERENCE_HEADING, REFERENCE_X, REFERENCE_Y = range(83, 87)
 # a solution that is kept while another is tried.
-KEPT = 87
+KEPT = 88
 STAGE = 96
-"""Rounded up to whole cache lines."""
+"""A whole number of cache lines."""
 SENSITIVITY = DERIVATIVES
 """First of 30 working entries of `linearisation`; gains and step overwrite them later."""
 
@@ -73,6 +81,14 @@ LONGEST = 176
     SLOPE_A, SLOPE_DELTA, SLOPE_CHANGE_A, SLOPE_CHANGE_DELTA, SLOPE_RATE, SLOPE_VX, SLOPE_VY,
 ) = range(185, 192)  # fmt: skip
 LANES = 192
+
+
+@compiled_in_place
+def grid(constants: Array, row: int, horizon: int) -> Array:
+    """Return a row of the stages' grid, (N,)."""
+    first = CONSTANTS_SIZE + row * horizon
+    values: Array = constants[first : first + horizon]
+    return values
 
 
 def working_space(horizon: int, solvers: int) -> tuple[Array, Array]:

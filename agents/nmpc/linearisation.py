@@ -9,9 +9,9 @@ The derivatives of a period are stored in its stage (`layout`), in this order::
 
     0..17   columns vx, vy, r of A, six rows each     18, 19  A[X, psi], A[Y, psi]
     20..31  columns a, delta of B, six rows each
-    32      vx' at the period's start                 33..36  its derivatives by vx, vy, r, delta
+    32      vx' at the period's start                 33..37  its derivatives by vx, vy, r, delta, a
 
-The other columns of A are unit vectors, and dvx'/da is 1.
+The other columns of A are unit vectors.
 """
 
 import math
@@ -41,7 +41,11 @@ Array = NDArray[Any]
 Float = Any
 Six = Any
 
-HEADING_X, HEADING_Y, RATE, RATE_VX, RATE_VY, RATE_R, RATE_DELTA = 18, 19, 32, 33, 34, 35, 36
+HEADING_X, HEADING_Y, RATE, RATE_VX, RATE_VY, RATE_R, RATE_DELTA, RATE_A = (
+    18, 19, 32, 33, 34, 35, 36, 37,
+)  # fmt: skip
+RESOLVED = 1.5
+"""Largest product of a Runge-Kutta step that is chosen by speed and the fastest lateral pole."""
 SEEDS = 5
 """Number of integrated directions: vx, vy, r at the period's start, a, delta."""
 DYNAMIC = (VX, VY, YAW_RATE)
@@ -101,11 +105,28 @@ def mixed(a: Float, x: Six, b: Float, y: Six) -> Six:
 
 
 @compiled_internal
-def advance(state: Any, a: Float, delta: Float, p: Array) -> Any:
-    """State (vx, vy, psi, r, X, Y) after a period with constant inputs; `p` are the constants."""
+def substeps(vx: Float, a: Float, length: Float, most: Float, p: Array) -> int:
+    """Return the Runge-Kutta steps of a stage that starts at vx (m/s), at most the grid's.
+
+    Where `p` names a pole, the steps resolve it at the lowest speed of the stage.
+    """
+    if p[L.POLE] <= 0.0:
+        return int(most)
+    slowest = max(abs(vx) - abs(a) * length, 0.0)
+    wanted = math.ceil(length * p[L.POLE] * compiled_inverse_speed(slowest) * (1.0 / RESOLVED))
+    return int(min(max(wanted, 1.0), most))
+
+
+@compiled_internal
+def advance(state: Any, a: Float, delta: Float, length: Float, most: Float, p: Array) -> Any:
+    """State (vx, vy, psi, r, X, Y) after a stage of `length` s with constant inputs.
+
+    `most` are the grid's Runge-Kutta steps of the stage, and `p` the constants.
+    """
+    n = substeps(state[VX], a, length, most, p)
     vx, vy, psi, r, x, y = integrate(
         state[VX], state[VY], 0.0, state[YAW_RATE], 0.0, 0.0, a, delta,
-        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[L.SUBSTEP], int(p[L.SUBSTEPS]),
+        p[0], p[1], p[2], p[3], p[4], p[5], p[6], length / n, n,
     )  # fmt: skip
     c, s = math.cos(state[PSI]), math.sin(state[PSI])
     return vx, vy, state[PSI] + psi, r, state[X] + c * x - s * y, state[Y] + s * x + c * y
@@ -160,17 +181,18 @@ def _weighted(k1: Any, k2: Any, k3: Any, k4: Any) -> Any:
 
 
 @compiled_internal
-def differentiate(e: Array, p: Array, out: Array) -> None:
+def differentiate(e: Array, length: Float, most: Float, p: Array, out: Array) -> None:
     """Advance the plan's state from stage e to the next, `out`, and fill the derivatives of e.
 
-    The state is that of `advance`. Forward sensitivities through the stages of every Runge-Kutta
-    step, dk = J dz + J_u: exact to rounding for the discrete map, not for the flow that it
-    approximates.
+    The state is that of `advance`, which describes the arguments. Forward sensitivities through the
+    stages of every Runge-Kutta step, dk = J dz + J_u: exact to rounding for the discrete map, not
+    for the flow that it approximates.
     """
-    h, n = p[L.SUBSTEP], int(p[L.SUBSTEPS])
     model = (p[0], p[1], p[2], p[3], p[4], p[5], p[6])
     a, delta = e[L.PLAN_A], e[L.PLAN_DELTA]
     vx, vy, r = e[L.PLAN_VX], e[L.PLAN_VY], e[L.PLAN_R]
+    n = substeps(vx, a, length, most, p)
+    h = length / n
     c, s, psi, x, y = 1.0, 0.0, 0.0, 0.0, 0.0
     cd, sd = math.cos(delta), math.sin(delta)
     half, sixth = 0.5 * h, h / 6.0
@@ -183,6 +205,7 @@ def differentiate(e: Array, p: Array, out: Array) -> None:
         if step == 0:
             e[RATE] = k1[0]
             e[RATE_VX], e[RATE_VY], e[RATE_R], e[RATE_DELTA] = j1[0], j1[1], j1[2], j1[3]
+            e[RATE_A] = 1.0
         c2, s2 = rotate(c, s, half * k1[2])
         k2, j2 = _rates(
             vx + half * k1[0], vy + half * k1[1], r + half * k1[3], c2, s2, a, delta, cd, sd, model
@@ -237,8 +260,10 @@ def differentiate(e: Array, p: Array, out: Array) -> None:
 @compiled
 def differentiate_along(stages: Array, constants: Array) -> None:
     """Roll the plan in `stages` out from its first state, and fill all stages' derivatives."""
-    for i in range(stages.shape[0] - 1):
-        differentiate(stages[i], constants, stages[i + 1])
+    n = stages.shape[0] - 1
+    lengths, most = L.grid(constants, L.LENGTH, n), L.grid(constants, L.SUBSTEPS, n)
+    for i in range(n):
+        differentiate(stages[i], lengths[i], most[i], constants, stages[i + 1])
 
 
 def unpacked(stages: Array) -> Linearisation:
@@ -247,14 +272,14 @@ def unpacked(stages: Array) -> Linearisation:
     n = len(records)
     a_matrices = np.tile(np.eye(6), (n, 1, 1))
     b_matrices = np.zeros((n, 6, 2))
-    rate_x, rate_u = np.zeros((n, 6)), np.ones((n, 2))
+    rate_x, rate_u = np.zeros((n, 6)), np.zeros((n, 2))
     for k, column in enumerate(DYNAMIC):
         a_matrices[:, :, column] = records[:, 6 * k : 6 * k + 6]
         rate_x[:, column] = records[:, RATE_VX + k]
     a_matrices[:, X, PSI], a_matrices[:, Y, PSI] = records[:, HEADING_X], records[:, HEADING_Y]
     for k in range(2):
         b_matrices[:, :, k] = records[:, 20 + 6 * k : 26 + 6 * k]
-    rate_u[:, 1] = records[:, RATE_DELTA]
+    rate_u[:, 0], rate_u[:, 1] = records[:, RATE_A], records[:, RATE_DELTA]
     return Linearisation(
         states.copy(), a_matrices, b_matrices, records[:, RATE].copy(), rate_x, rate_u
     )
@@ -273,4 +298,5 @@ def pack(model: Linearisation, inputs: Array, stages: Array) -> None:
     stages[:-1, HEADING_X], stages[:-1, HEADING_Y] = model.A[:, X, PSI], model.A[:, Y, PSI]
     for k in range(2):
         stages[:-1, 20 + 6 * k : 26 + 6 * k] = model.B[:, :, k]
-    stages[:-1, RATE], stages[:-1, RATE_DELTA] = model.rate, model.rate_u[:, 1]
+    stages[:-1, RATE] = model.rate
+    stages[:-1, RATE_A], stages[:-1, RATE_DELTA] = model.rate_u.T

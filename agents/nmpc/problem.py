@@ -3,14 +3,21 @@
 State x = [vx, vy, psi, r, X, Y] and reference in the frame of the path's foot point, input
 u = [a, delta], output y = C x = [vx, psi, X, Y] (kumar2025lpv, section III)::
 
-    min   1/2 e_N' S e_N + 1/2 sum_{i<N} (e_i' Q e_i + u_i' R u_i) + sum penalty(slack)
-    e_i = reference_i - C x_i
+    min   1/2 e_N' S e_N + sum_{i<N} h_i/T0 [ 1/2 (e_i' Q e_i + u_i' R u_i) + penalty(slack_i) ]
+                         + sum_{i<N} d_i/T0   1/2 v_i' R_rate v_i
+    e_i = reference_i - C x_i,  v_i = (u_i - u_{i-1}) / d_i                   (u_{-1}: in force now)
     x_{i+1} = F(x_i, u_i)                        Runge-Kutta steps of x' = A(x, u) x + B(x, u) u
     |delta_i| <= delta_max,  a_min <= a_i <= a_max
-    |delta_i - delta_{i-1}| <= Ts delta'_max,  |a_i - a_{i-1}| <= Ts a'_max   (u_{-1}: in force now)
+    |delta_i - delta_{i-1}| <= d_i delta'_max,  |a_i - a_{i-1}| <= d_i a'_max
     vx_min <= vx_i <= vx_max        (soft)       i = 1..N
     |vy_i| <= ratio vx_i            (soft)       i = 1..N
     vx'_min <= vx'(x_i, u_i) <= vx'_max (soft)   i = 0..N-1
+
+Stage i is h_i long, and d_i is the time from the middle of the stage before to its own middle; the
+bound on the first change allows for one control period. The sums approximate integrals over time,
+per T0 = 0.05 s, the period for which the weights were first chosen: so weights and penalties mean
+the same for stages of any length and number. The paper's cost is that of stages of T0 without
+R_rate, which it has not.
 
 A soft constraint may be violated by a slack s >= 0 at a cost of linear s + 1/2 quadratic s^2. This
 penalty is exact for multipliers below `linear`, so slack is used only where the path demands the
@@ -25,6 +32,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.weights import WEIGHTS
 from lpv_track_env.bicycle import fastest_pole
 from lpv_track_env.observation import MOST_STEPS
 from lpv_track_env.vehicle import VehicleParameters
@@ -33,10 +41,12 @@ from trajectories.arguments import Number, Whole, check_fields, numbers
 Array = NDArray[np.float64]
 
 STATES, INPUTS, OUTPUTS, SOFT = 6, 2, 4, 3
+NOMINAL_PERIOD = 0.05
+"""T0, s: a stage of this length has the cost of its weights."""
 RK4_STABILITY = 2.78
 """Largest product of step and pole for which classic Runge-Kutta is stable (real poles)."""
 HORIZON = Whole(1, MOST_STEPS)
-"""Rule of the number of predicted periods."""
+"""Rule of the number of stages."""
 PERIOD, PENALTY = Number(0.0, 10.0, "s", above=True), Number(0.0, 1e12)
 
 
@@ -64,24 +74,28 @@ class NmpcProblem:
     vehicle
         Prediction model and its constraints.
     horizon
-        Number of predicted periods, N.
+        Number of stages, N.
     period
-        Period of the prediction, Ts, s.
+        Length of a stage, s.
+    stages
+        Lengths of the stages, (N,) s, where they differ.
     first_period
         Time until the next plan, s, over which the change of the first input is bounded; by default
-        Ts.
+        the first stage's length.
     linear_penalty, quadratic_penalty
         Penalties of slack on (vx m/s, vy m/s, vx' m/s^2), shape (3,).
 
     Raises
     ------
     ValueError
-        For a horizon below 1, a period that is not positive, or a negative penalty.
+        For a horizon below 1, a period that is not positive, another number of stages, or a
+        negative penalty.
     """
 
     vehicle: VehicleParameters
     horizon: int = 20
-    period: float = 0.05
+    period: float = 0.1
+    stages: tuple[float, ...] | None = None
     first_period: float | None = None
     linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0)
     quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0)
@@ -91,6 +105,9 @@ class NmpcProblem:
         if self.first_period is not None:
             rules["first_period"] = PERIOD
         check_fields(self, rules)
+        if self.stages is not None:
+            stages = numbers("stages", self.stages, PERIOD, self.horizon)
+            object.__setattr__(self, "stages", stages)
         for name in ("linear_penalty", "quadratic_penalty"):
             object.__setattr__(self, name, numbers(name, getattr(self, name), PENALTY, 3))
 
@@ -100,7 +117,7 @@ class NmpcProblem:
         """Pack what a solve depends on into a vector; None if it is beyond all arithmetic.
 
         That is the state (6,), the input in force (2,), the reference (N + 1, 4) and the weights
-        (10,), of which each number must be finite and at most `LARGEST`.
+        (12,), of which each number must be finite and at most `LARGEST`.
 
         Raises
         ------
@@ -109,7 +126,7 @@ class NmpcProblem:
         """
         given = {"state": state, "last_input": last_input, "reference": reference,
                  "weights": weights}  # fmt: skip
-        shapes = (STATES,), (INPUTS,), (self.horizon + 1, OUTPUTS), (2 * OUTPUTS + INPUTS,)
+        shapes = (STATES,), (INPUTS,), (self.horizon + 1, OUTPUTS), (WEIGHTS,)
         for (name, value), shape in zip(given.items(), shapes, strict=True):
             if np.shape(value) != shape:
                 raise ValueError(f"{name} must have shape {shape}, not {np.shape(value)}")
@@ -117,13 +134,31 @@ class NmpcProblem:
         return packed if (np.abs(packed) <= LARGEST).all() else None  # NaN is not, either
 
     @property
-    def substeps(self) -> int:
-        """Runge-Kutta steps per period, for stability from the least permitted speed upwards.
+    def periods(self) -> Array:
+        """Length of each stage, (N,) s."""
+        given = self.period if self.stages is None else self.stages
+        return np.broadcast_to(np.array(given, dtype=np.float64), (self.horizon,)).copy()
+
+    @property
+    def times(self) -> Array:
+        """Times of the nodes, (N + 1,) s."""
+        return np.concatenate([[0.0], np.cumsum(self.periods)])
+
+    @property
+    def substeps(self) -> NDArray[np.int64]:
+        """Runge-Kutta steps of each stage (N,), for stability from the least permitted speed on.
 
         The lateral poles are fastest at standstill, which a speed range may include.
         """
-        slowest = max(self.vehicle.speed_range[0], 0.0)
-        return math.ceil(self.period * fastest_pole(slowest, self.vehicle) / RK4_STABILITY)
+        pole = fastest_pole(max(self.vehicle.speed_range[0], 0.0), self.vehicle)
+        return np.ceil(self.periods * (pole / RK4_STABILITY)).astype(np.int64)
+
+    @property
+    def spacings(self) -> Array:
+        """Time from the middle of the input before to the middle of each stage's input, (N,) s."""
+        periods, first = self.periods, self.first_period
+        before: Array = np.append(periods[0] if first is None else first, periods[:-1])
+        return 0.5 * (periods + before)
 
     @property
     def input_bounds(self) -> tuple[Array, Array]:
@@ -134,10 +169,10 @@ class NmpcProblem:
 
     @property
     def input_steps(self) -> Array:
-        """Largest change of u at the start of each period, (N, 2)."""
-        periods = np.full(self.horizon, self.period)
-        periods[0] = self.period if self.first_period is None else self.first_period
-        return np.outer(periods, [self.vehicle.max_jerk, self.vehicle.max_steering_rate])
+        """Largest change of u at the start of each stage, (N, 2)."""
+        times = self.spacings
+        times[0] = self.periods[0] if self.first_period is None else self.first_period
+        return np.outer(times, [self.vehicle.max_jerk, self.vehicle.max_steering_rate])
 
 
 class Solution(NamedTuple):

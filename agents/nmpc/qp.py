@@ -30,6 +30,7 @@ from agents.nmpc.linearisation import (
     HEADING_X,
     HEADING_Y,
     RATE,
+    RATE_A,
     RATE_DELTA,
     RATE_R,
     RATE_VX,
@@ -80,16 +81,15 @@ multipliers and the guesses cycle; if smaller, binding constraints take more ite
 @compiled_internal
 def clamp(stages: Array, at: int, last_a: Float, last_delta: Float, constants: Array) -> None:
     """Bring the inputs of a point (from column `at` on) within bounds and rates, first to last."""
-    before_a, before_delta = last_a, last_delta
-    most_a, most_delta = constants[L.FIRST_CHANGE_A], constants[L.FIRST_CHANGE_DELTA]
-    for i in range(stages.shape[0] - 1):
+    before_a, before_delta, n = last_a, last_delta, stages.shape[0] - 1
+    most_a, most_delta = L.grid(constants, L.CHANGE_A, n), L.grid(constants, L.CHANGE_DELTA, n)
+    for i in range(n):
         e = stages[i]
-        a = min(max(e[at], before_a - most_a), before_a + most_a)
-        delta = min(max(e[at + 1], before_delta - most_delta), before_delta + most_delta)
+        a = min(max(e[at], before_a - most_a[i]), before_a + most_a[i])
+        delta = min(max(e[at + 1], before_delta - most_delta[i]), before_delta + most_delta[i])
         before_a = min(max(a, constants[L.LOW_A]), constants[L.HIGH_A])
         before_delta = min(max(delta, -constants[L.MAX_DELTA]), constants[L.MAX_DELTA])
         e[at], e[at + 1] = before_a, before_delta
-        most_a, most_delta = constants[L.CHANGE_A], constants[L.CHANGE_DELTA]
 
 
 @compiled_internal
@@ -133,26 +133,26 @@ def measure_gaps(
     low_a, high_a, max_delta = constants[L.LOW_A], constants[L.HIGH_A], constants[L.MAX_DELTA]
     ratio = constants[L.RATIO]
     before_a, before_delta = last_a, last_delta
-    most_a, most_delta = constants[L.FIRST_CHANGE_A], constants[L.FIRST_CHANGE_DELTA]
     gap = lanes[L.GAP : L.GAP + L.PAIRS]
-    for i in range(gap.shape[1]):
+    n = gap.shape[1]
+    most_a, most_delta = L.grid(constants, L.CHANGE_A, n), L.grid(constants, L.CHANGE_DELTA, n)
+    for i in range(n):
         e, end = stages[i], stages[i + 1]
         a, delta = e[L.NOW_A], e[L.NOW_DELTA]
         gap[0, i], gap[1, i] = high_a - a, a - low_a
         gap[2, i], gap[3, i] = max_delta - delta, delta + max_delta
         change_a, change_delta = a - before_a, delta - before_delta
-        gap[4, i], gap[5, i] = most_a - change_a, change_a + most_a
-        gap[6, i], gap[7, i] = most_delta - change_delta, change_delta + most_delta
+        gap[4, i], gap[5, i] = most_a[i] - change_a, change_a + most_a[i]
+        gap[6, i], gap[7, i] = most_delta[i] - change_delta, change_delta + most_delta[i]
         vx, vy = end[L.NOW_VX], end[L.NOW_VY]
         gap[8, i], gap[9, i] = constants[L.HIGH_SPEED] - vx, vx - constants[L.LOW_SPEED]
         rate = e[RATE] + e[RATE_VX] * (e[L.NOW_VX] - e[L.PLAN_VX])
         rate += e[RATE_VY] * (e[L.NOW_VY] - e[L.PLAN_VY])
         rate += e[RATE_R] * (e[L.NOW_R] - e[L.PLAN_R])
-        rate += a - e[L.PLAN_A] + e[RATE_DELTA] * (delta - e[L.PLAN_DELTA])
+        rate += e[RATE_A] * (a - e[L.PLAN_A]) + e[RATE_DELTA] * (delta - e[L.PLAN_DELTA])
         gap[11, i], gap[12, i] = constants[L.HIGH_RATE] - rate, rate - constants[L.LOW_RATE]
         gap[14, i], gap[15, i] = ratio * vx - vy, ratio * vx + vy
         before_a, before_delta = a, delta
-        most_a, most_delta = constants[L.CHANGE_A], constants[L.CHANGE_DELTA]
 
 
 @compiled_internal
@@ -210,6 +210,7 @@ def fill_equalities(lanes: Array, constants: Array) -> None:
 
     Binding constraints enter by the augmented Lagrangian, broken soft ones by their penalty.
     """
+    shares = L.grid(constants, L.SHARE, lanes.shape[1])
     for k in range(L.PAIRS):
         gap, mode, lam = lanes[L.GAP + k], lanes[L.MODE + k], lanes[L.LAM + k]
         weight, force = lanes[L.WEIGHT + k], lanes[L.FORCE + k]
@@ -222,7 +223,8 @@ def fill_equalities(lanes: Array, constants: Array) -> None:
             if mode[i] == BINDING:
                 held, pull = STIFFNESS, lam[i] - STIFFNESS * gap[i]
             if mode[i] == BROKEN_SOFT:
-                held, pull = quadratic, linear - quadratic * gap[i]
+                held = quadratic * shares[i]
+                pull = linear * shares[i] - held * gap[i]
             weight[i], force[i] = held, pull
     ratio = constants[L.RATIO]
     w, b = lanes[L.WEIGHT : L.WEIGHT + L.PAIRS], lanes[L.FORCE : L.FORCE + L.PAIRS]
@@ -243,13 +245,14 @@ def fill_equalities(lanes: Array, constants: Array) -> None:
 def revise(lanes: Array, constants: Array) -> tuple[int, Float]:
     """Revise the guess after a step; return the number of changes and the largest binding gap."""
     changed, off = 0, 0.0
+    shares = L.grid(constants, L.SHARE, lanes.shape[1])
     for k in range(L.PAIRS):
         if is_slack(k):
             continue
         gaps, mode, lam = lanes[L.GAP + k], lanes[L.MODE + k], lanes[L.LAM + k]
-        linear = constants[L.LINEAR + (k - 8) // 3] if k >= 8 else math.inf
+        price = constants[L.LINEAR + (k - 8) // 3] if k >= 8 else math.inf
         for i in range(lanes.shape[1]):
-            gap, was = gaps[i], mode[i]
+            gap, was, linear = gaps[i], mode[i], price * shares[i]
             if was == FREE:
                 if gap < -HELD:
                     mode[i], lam[i] = BINDING, 0.0
@@ -287,9 +290,9 @@ def solve_qp(
 ) -> int:  # fmt: skip
     """Solve the QP linearised along the plan of `stages`, from the derivatives stored there.
 
-    (last_a, last_delta) is the input in force, `weights` (10,) are Q, S, R. Writes the solution to
-    the stages' NOW and its slacks to the lanes, adds to the statistics `stats` (STATS,), and
-    returns a code.
+    (last_a, last_delta) is the input in force, `weights` (12,) are Q, S, R, R_rate. Writes the
+    solution to the stages' NOW and its slacks to the lanes, adds to the statistics `stats`
+    (STATS,), and returns a code.
     """
     n = lanes.shape[1]
     copy_point(stages, L.NOW_A, L.PLAN_A)
@@ -316,7 +319,7 @@ def solve_qp(
             fill_gradient(lanes, constants, share)
         if phase == PREDICTING or (phase == GUESSING and changed > 0):
             riccati.factor(stages, lanes, weights, constants)
-        riccati.solve(stages, lanes, weights, constants)
+        riccati.solve(stages, lanes, last_a, last_delta, weights, constants)
         length = 1.0
         if phase != GUESSING:
             length = expand_step(stages, lanes, constants, share)

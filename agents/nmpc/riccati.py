@@ -26,6 +26,7 @@ from agents.nmpc import layout as L
 from agents.nmpc.linearisation import (
     HEADING_X,
     HEADING_Y,
+    RATE_A,
     RATE_DELTA,
     RATE_R,
     RATE_VX,
@@ -86,12 +87,13 @@ def _put(e: Array, at: int, ka: Six, by: Float, c: Six) -> None:
 
 @compiled_internal
 def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> None:
-    """Fill the stages' gains for weights (10,), the damping of `constants` and the barrier.
+    """Fill the stages' gains for weights (12,), the damping of `constants` and the barrier.
 
     If a matrix M is not positive definite the gains are not finite.
     """
     n = lanes.shape[1]
-    ra, rd = weights[8] + constants[L.DAMPING_A], weights[9] + constants[L.DAMPING_DELTA]
+    shares, smooth = L.grid(constants, L.SHARE, n), L.grid(constants, L.SMOOTH, n)
+    damping_a, damping_delta = constants[L.DAMPING_A], constants[L.DAMPING_DELTA]
     p00 = weights[4] + lanes[L.BARRIER_VX, n - 1]
     p01, p11 = lanes[L.BARRIER_CROSS, n - 1], lanes[L.BARRIER_VY, n - 1]
     p22, p44, p55 = weights[5], weights[6], weights[7]
@@ -109,11 +111,14 @@ def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> Non
         )  # fmt: skip
         # (P B + T)', then B' P B with T and U: the Hessian of the cost-to-go by u.
         ga, gd = plus(_product(p, ba), ta), plus(_product(p, bd), td)
-        h, n_delta = lanes[L.BARRIER_RATE, i], e[RATE_DELTA]
-        haa = ra + lanes[L.BARRIER_A, i] + dot(ba, ga) + dot(ba, ta) + uaa
-        hdd = rd + lanes[L.BARRIER_DELTA, i] + dot(bd, gd) + dot(bd, td) + udd
+        h, n_a, n_delta, share = lanes[L.BARRIER_RATE, i], e[RATE_A], e[RATE_DELTA], shares[i]
+        haa = weights[8] * share + damping_a + lanes[L.BARRIER_A, i]
+        haa += dot(ba, ga) + dot(ba, ta) + uaa
+        hdd = weights[9] * share + damping_delta + lanes[L.BARRIER_DELTA, i]
+        hdd += dot(bd, gd) + dot(bd, td) + udd
         had = dot(bd, ga) + dot(ba, td) + uad
-        wa, wd = lanes[L.BARRIER_CHANGE_A, i], lanes[L.BARRIER_CHANGE_DELTA, i]
+        wa = lanes[L.BARRIER_CHANGE_A, i] + weights[10] * smooth[i]
+        wd = lanes[L.BARRIER_CHANGE_DELTA, i] + weights[11] * smooth[i]
         maa, mdd = haa + wa, hdd + wd
         determinant = maa * mdd - had * had
         # A determinant that is not positive gives NaN gains, which the caller checks.
@@ -122,9 +127,9 @@ def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> Non
         # G = B' P A + T' A.
         qa, qd = _back(a0, a1, a3, a42, a52, ga), _back(a0, a1, a3, a42, a52, gd)
         # The term in vx' by Sherman and Morrison: h may be huge, and differences of huge numbers
-        # would cancel P. With m = (1, n_delta), y = M^-1 m, c = n - G' y: P gains k c c'.
-        fa, fd = iaa + iad * n_delta, iad + idd * n_delta
-        k = h / (1.0 + h * (fa + n_delta * fd))
+        # would cancel P. With m = (n_a, n_delta), y = M^-1 m, c = n - G' y: P gains k c c'.
+        fa, fd = iaa * n_a + iad * n_delta, iad * n_a + idd * n_delta
+        k = h / (1.0 + h * (n_a * fa + n_delta * fd))
         qa0, qa1, qa2, qa3, qa4, qa5 = qa
         qd0, qd1, qd2, qd3, qd4, qd5 = qd
         c0, c1 = e[RATE_VX] - qa0 * fa - qd0 * fd, e[RATE_VY] - qa1 * fa - qd1 * fd
@@ -150,7 +155,7 @@ def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> Non
         y22 = p22 + a42 * p24 + a52 * p25
         y24 = p24 + a42 * p44 + a52 * p45
         y25 = p25 + a42 * p45 + a52 * p55
-        h0, h1 = weights[0] + lanes[L.BARRIER_VX, i - 1], lanes[L.BARRIER_VY, i - 1]
+        h0, h1 = weights[0] * share + lanes[L.BARRIER_VX, i - 1], lanes[L.BARRIER_VY, i - 1]
         h5 = lanes[L.BARRIER_CROSS, i - 1]
         ka0, ka1, ka2, ka3, ka4, ka5 = ka
         kd0, kd1, kd2, kd3, kd4, kd5 = kd
@@ -166,16 +171,18 @@ def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> Non
         p13 = _entry(z3[1], k, c1, c3, qa1, ka3, qd1, kd3)
         p14 = _entry(z1[4], k, c4, c1, qa1, ka4, qd1, kd4)
         p15 = _entry(z1[5], k, c5, c1, qa1, ka5, qd1, kd5)
-        p22 = _entry(y22 + a42 * y24 + a52 * y25 + weights[1], k, c2, c2, qa2, ka2, qd2, kd2)
+        p22 = _entry(
+            y22 + a42 * y24 + a52 * y25 + weights[1] * share, k, c2, c2, qa2, ka2, qd2, kd2
+        )
         p23 = _entry(z3[2], k, c2, c3, qa3, ka2, qd3, kd2)
         p24 = _entry(y24, k, c4, c2, qa2, ka4, qd2, kd4)
         p25 = _entry(y25, k, c5, c2, qa2, ka5, qd2, kd5)
         p33 = _entry(z3[3], k, c3, c3, qa3, ka3, qd3, kd3)
         p34 = _entry(z3[4], k, c4, c3, qa3, ka4, qd3, kd4)
         p35 = _entry(z3[5], k, c5, c3, qa3, ka5, qd3, kd5)
-        p44 = _entry(p44 + weights[2], k, c4, c4, qa4, ka4, qd4, kd4)
+        p44 = _entry(p44 + weights[2] * share, k, c4, c4, qa4, ka4, qd4, kd4)
         p45 = _entry(p45, k, c4, c5, qa4, ka5, qd4, kd5)
-        p55 = _entry(p55 + weights[3], k, c5, c5, qa5, ka5, qd5, kd5)
+        p55 = _entry(p55 + weights[3] * share, k, c5, c5, qa5, ka5, qd5, kd5)
         # T = K' W, U = W M^-1 (M - W): no cancellation where W is large.
         ta, td = scaled(taken(e, L.GAIN_A), wa), scaled(taken(e, L.GAIN_DELTA), wd)
         uaa = wa * (iaa * haa + iad * had + kfa * fa * wa)
@@ -207,9 +214,15 @@ def _turned(
 
 
 @compiled_internal
-def solve(stages: Array, lanes: Array, weights: Array, constants: Array) -> None:
-    """Fill the stages' step from gains, solution and slope; the damping pulls to the plan."""
+def solve(
+    stages: Array, lanes: Array, last_a: Float, last_delta: Float, weights: Array, constants: Array
+) -> None:
+    """Fill the stages' step from gains, solution and slope; the damping pulls to the plan.
+
+    (last_a, last_delta) is the input in force.
+    """
     n = lanes.shape[1]
+    shares, smooth = L.grid(constants, L.SHARE, n), L.grid(constants, L.SMOOTH, n)
     damping_a, damping_delta = constants[L.DAMPING_A], constants[L.DAMPING_DELTA]
     e = stages[n]
     s0 = weights[4] * (e[L.NOW_VX] - e[L.REFERENCE]) + lanes[L.SLOPE_VX, n - 1]
@@ -220,11 +233,16 @@ def solve(stages: Array, lanes: Array, weights: Array, constants: Array) -> None
     for i in range(n - 1, -1, -1):
         e = stages[i]
         a, delta, along = e[L.NOW_A], e[L.NOW_DELTA], lanes[L.SLOPE_RATE, i]
-        change_a, change_delta = lanes[L.SLOPE_CHANGE_A, i], lanes[L.SLOPE_CHANGE_DELTA, i]
+        share, before_a, before_delta = shares[i], last_a, last_delta
+        if i > 0:
+            before_a, before_delta = stages[i - 1, L.NOW_A], stages[i - 1, L.NOW_DELTA]
+        change_a = lanes[L.SLOPE_CHANGE_A, i] + weights[10] * smooth[i] * (a - before_a)
+        change_delta = lanes[L.SLOPE_CHANGE_DELTA, i]
+        change_delta += weights[11] * smooth[i] * (delta - before_delta)
         s = (s0, s1, s2, s3, s4, s5)
-        ma = weights[8] * a + damping_a * (a - e[L.PLAN_A]) + along + lanes[L.SLOPE_A, i]
-        ma = ma + change_a + ta + _along(e, 20, s)
-        md = weights[9] * delta + damping_delta * (delta - e[L.PLAN_DELTA])
+        ma = weights[8] * share * a + damping_a * (a - e[L.PLAN_A]) + along * e[RATE_A]
+        ma = ma + lanes[L.SLOPE_A, i] + change_a + ta + _along(e, 20, s)
+        md = weights[9] * share * delta + damping_delta * (delta - e[L.PLAN_DELTA])
         md += along * e[RATE_DELTA] + lanes[L.SLOPE_DELTA, i] + change_delta + td
         md += _along(e, 26, s)
         ka = e[L.INVERSE_AA] * ma + e[L.INVERSE_AD] * md
@@ -233,17 +251,17 @@ def solve(stages: Array, lanes: Array, weights: Array, constants: Array) -> None
         ta, td = e[L.HOLD_A] * ka - change_a, e[L.HOLD_DELTA] * kd - change_delta
         if i == 0:
             break
-        f0 = _along(e, 0, s) + weights[0] * (e[L.NOW_VX] - e[L.REFERENCE])
+        f0 = _along(e, 0, s) + weights[0] * share * (e[L.NOW_VX] - e[L.REFERENCE])
         f0 += lanes[L.SLOPE_VX, i - 1]
         f1 = _along(e, 6, s) + lanes[L.SLOPE_VY, i - 1] + along * e[RATE_VY]
         f2 = s2 + e[HEADING_X] * s4 + e[HEADING_Y] * s5
-        f2 += weights[1] * (e[L.NOW_PSI] - e[L.REFERENCE_HEADING])
+        f2 += weights[1] * share * (e[L.NOW_PSI] - e[L.REFERENCE_HEADING])
         s3 = _along(e, 12, s) + along * e[RATE_R] - e[L.GAIN_A + 3] * ma - e[L.GAIN_DELTA + 3] * md
         s0 = f0 + along * e[RATE_VX] - (e[L.GAIN_A] * ma + e[L.GAIN_DELTA] * md)
         s1 = f1 - e[L.GAIN_A + 1] * ma - e[L.GAIN_DELTA + 1] * md
         s2 = f2 - e[L.GAIN_A + 2] * ma - e[L.GAIN_DELTA + 2] * md
-        f4 = weights[2] * (e[L.NOW_X] - e[L.REFERENCE_X])
-        f5 = weights[3] * (e[L.NOW_Y] - e[L.REFERENCE_Y])
+        f4 = weights[2] * share * (e[L.NOW_X] - e[L.REFERENCE_X])
+        f5 = weights[3] * share * (e[L.NOW_Y] - e[L.REFERENCE_Y])
         s4 += f4 - e[L.GAIN_A + 4] * ma - e[L.GAIN_DELTA + 4] * md
         s5 += f5 - e[L.GAIN_A + 5] * ma - e[L.GAIN_DELTA + 5] * md
     x0 = x1 = x2 = x3 = x4 = x5 = 0.0

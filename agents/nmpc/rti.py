@@ -27,7 +27,7 @@ from agents.nmpc.qp import (
     clamp,
     solve_qp,
 )
-from agents.reference import NODE, fill_nodes
+from agents.reference import NODE, fill_nodes_at
 from lpv_track_env import observation as entry
 from trajectories.compilation import (
     compiled,
@@ -53,7 +53,7 @@ class NmpcArrays(NamedTuple):
     """Constants of an NMPC and its memory of n vehicles, for compiled code."""
 
     constants: Array
-    """(CONSTANTS_SIZE,), see `layout`."""
+    """(CONSTANTS_SIZE + GRID N,), see `layout`."""
     plans: Array
     """Inputs of the last plans, (n, N, 2)."""
     flags: Array
@@ -67,9 +67,16 @@ class NmpcArrays(NamedTuple):
 
 
 @compiled_internal
-def cost_of(stages: Array, lanes: Array, at: int, weights: Array, constants: Array) -> Float:
-    """Cost of the problem for a point of the stages (from column `at` on) and the slacks."""
+def cost_of(
+    stages: Array, lanes: Array, at: int, last_a: Float, last_delta: Float, weights: Array,
+    constants: Array,
+) -> Float:  # fmt: skip
+    """Cost of the problem for a point of the stages (from column `at` on) and the slacks.
+
+    (last_a, last_delta) is the input in force.
+    """
     n = lanes.shape[1]
+    shares, smooth = L.grid(constants, L.SHARE, n), L.grid(constants, L.SMOOTH, n)
     vx, psi, x, y = (
         at + L.NOW_VX - L.NOW_A,
         at + L.NOW_PSI - L.NOW_A,
@@ -81,14 +88,21 @@ def cost_of(stages: Array, lanes: Array, at: int, weights: Array, constants: Arr
         offset, e = 4 if i == n else 0, stages[i]
         e0, e1 = e[vx] - e[L.REFERENCE], e[psi] - e[L.REFERENCE_HEADING]
         e2, e3 = e[x] - e[L.REFERENCE_X], e[y] - e[L.REFERENCE_Y]
-        total += weights[offset] * e0 * e0 + weights[offset + 1] * e1 * e1
-        total += weights[offset + 2] * e2 * e2 + weights[offset + 3] * e3 * e3
+        error = weights[offset] * e0 * e0 + weights[offset + 1] * e1 * e1
+        error += weights[offset + 2] * e2 * e2 + weights[offset + 3] * e3 * e3
+        total += error if i == n else shares[i] * error
+    before_a, before_delta = last_a, last_delta
     for i in range(n):
         a, delta = stages[i, at], stages[i, at + 1]
-        total += weights[8] * a * a + weights[9] * delta * delta
+        effort = weights[8] * a * a + weights[9] * delta * delta
         for soft in range(3):
             s = lanes[L.SLACKS[soft], i]
-            total += s * (2.0 * constants[L.LINEAR + soft] + constants[L.QUADRATIC + soft] * s)
+            effort += s * (2.0 * constants[L.LINEAR + soft] + constants[L.QUADRATIC + soft] * s)
+        total += shares[i] * effort
+        change_a, change_delta = a - before_a, delta - before_delta
+        rates = weights[10] * change_a * change_a + weights[11] * change_delta * change_delta
+        total += smooth[i] * rates
+        before_a, before_delta = a, delta
     return 0.5 * total
 
 
@@ -99,18 +113,20 @@ def solve(
 ) -> int:  # fmt: skip
     """Do one real-time iteration on the plan, its first state and the reference in `stages`.
 
-    (last_a, last_delta) is the input in force, weights (10,). Writes the improved plan to the
+    (last_a, last_delta) is the input in force, weights (12,). Writes the improved plan to the
     stages' NOW, fills the statistics `stats` (STATS,) and returns a code; only with SUCCESS is the
     plan valid.
     """
     stats[INNER] = stats[OUTER] = 0.0
     clamp(stages, L.PLAN_A, last_a, last_delta, constants)
-    for i in range(lanes.shape[1]):
-        differentiate(stages[i], constants, stages[i + 1])
+    n = lanes.shape[1]
+    lengths, most = L.grid(constants, L.LENGTH, n), L.grid(constants, L.SUBSTEPS, n)
+    for i in range(n):
+        differentiate(stages[i], lengths[i], most[i], constants, stages[i + 1])
     code = solve_qp(stages, lanes, last_a, last_delta, weights, constants, stats)
     stats[COST] = math.nan
     if code == SUCCESS:
-        stats[COST] = cost_of(stages, lanes, L.NOW_A, weights, constants)
+        stats[COST] = cost_of(stages, lanes, L.NOW_A, last_a, last_delta, weights, constants)
     for soft in range(3):
         largest = 0.0
         if code == SUCCESS:
@@ -137,8 +153,9 @@ def load_observation(observation: Array, constants: Array, stages: Array) -> boo
     e[L.PLAN_X], e[L.PLAN_Y] = 0.0, o[entry.LATERAL_ERROR]
     first = entry.PREVIEW_START
     speeds = first + (o.shape[0] - first) // 2
-    fill_nodes(
-        o[first:speeds], o[entry.REFERENCE_SPEED], o[speeds:], constants[L.PERIOD],
+    fill_nodes_at(
+        o[first:speeds], o[entry.REFERENCE_SPEED], o[speeds:], constants[L.PREVIEW_PERIOD],
+        L.grid(constants, L.LENGTH, stages.shape[0] - 1),
         stages[:, L.REFERENCE : L.REFERENCE + NODE],
     )  # fmt: skip
     return True
@@ -160,12 +177,13 @@ def control(
 ) -> int:  # fmt: skip
     """Control some vehicles: fill their rows of `actions` (n, 2); returns how many solves failed.
 
-    Observations (m, size) are those of rows first to first + m - 1 of all n. `weights` is (n, 10),
-    or (1, 10) for all. `constants` to `actions` are those of `NmpcArrays`; they are passed one by
+    Observations (m, size) are those of rows first to first + m - 1 of all n. `weights` is (n, 12),
+    or (1, 12) for all. `constants` to `actions` are those of `NmpcArrays`; they are passed one by
     one because this is called from Python every control period. After a failure the last plan
     stays, a period older, and no longer warm-starts. `stages` and `lanes` are working space.
     """
     n, failed = lanes.shape[1], 0
+    shift = L.grid(constants, L.SHIFT, n)
     for j in range(observations.shape[0]):
         row = first + j
         code = NOT_FINITE
@@ -180,11 +198,11 @@ def control(
             for i in range(n):
                 a, delta = last_a, last_delta
                 if flags[row, WARM] > 0:
-                    # Shift the plan by the share of its period that has passed; hold its end.
+                    # Shift the plan by the share of each stage that has passed; hold its end.
                     ahead = min(i + 1, n - 1)
                     a, delta = plans[row, i, 0], plans[row, i, 1]
-                    a += constants[L.SHIFT] * (plans[row, ahead, 0] - a)
-                    delta += constants[L.SHIFT] * (plans[row, ahead, 1] - delta)
+                    a += shift[i] * (plans[row, ahead, 0] - a)
+                    delta += shift[i] * (plans[row, ahead, 1] - delta)
                 stages[i, L.PLAN_A], stages[i, L.PLAN_DELTA] = a, delta
             own = row if weights.shape[0] > 1 else 0
             code = solve(stages, lanes, last_a, last_delta, weights[own], constants, stats[row])

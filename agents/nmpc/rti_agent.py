@@ -14,7 +14,8 @@ from agents.nmpc import layout, qp, rti
 from agents.nmpc.base import Fallback, NmpcAgent, NmpcSettings
 from agents.nmpc.problem import INPUTS, STATES, Status
 from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
-from agents.nmpc.schedule import NO_BAND, WEIGHTS
+from agents.nmpc.schedule import NO_BAND
+from agents.weights import WEIGHTS
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.validation import checked_threads, forwards_arguments
 from lpv_track_env.vector_kernels import shares, using_threads
@@ -26,7 +27,7 @@ class RtiMemory:
     """Memory of n vehicles of the real-time NMPC: arrays for compiled code, a row a vehicle.
 
     `plans`, `flags`, `stats`, `states` and `actions` are those of `rti.NmpcArrays`; with a
-    schedule, `bands` (n,) and `weights` (n, 10) are the bands and weights in use.
+    schedule, `bands` (n,) and `weights` (n, 12) are the bands and weights in use.
     """
 
     def __init__(self, rows: int, horizon: int) -> None:
@@ -122,7 +123,10 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         threads: int = 1,
     ) -> None:
         super().__init__(task, NmpcSettings(**settings))
-        self.solver = RtiSolver(self.problem, damping=damping, tolerance=tolerance)
+        self.solver = RtiSolver(
+            self.problem, damping=damping, tolerance=tolerance,
+            preview_period=task.layout.preview_period, steps_by_speed=True,
+        )  # fmt: skip
         space = slice(layout.SPACE_LOW_A, layout.SPACE_HIGH_DELTA + 1)
         self.solver.constants[space] = [*self._low, *self._high]
         self._threads = checked_threads(threads)
@@ -192,7 +196,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         return (actions[0] if np.ndim(observation) == 1 else actions), memory
 
     def solve_rows(self, rows: Array, weights: Array, memory: RtiMemory) -> int:
-        """Solve for every row of observations (n, size), with weights (n or 1, 10), into `memory`.
+        """Solve for every row of observations (n, size), with weights (n or 1, 12), into `memory`.
 
         Returns the number of failed solves; their rows keep the action of the last step.
         """

@@ -12,8 +12,13 @@ from numpy.typing import NDArray
 from agents.nmpc import layout as L
 from agents.nmpc import linearisation, qp, rti
 from agents.nmpc.linearisation import Linearisation
-from agents.nmpc.problem import INPUTS, STATES, NmpcProblem, Solution, Status
-from lpv_track_env.bicycle import compiled_field, compiled_inverse_speed
+from agents.nmpc.problem import INPUTS, NOMINAL_PERIOD, STATES, NmpcProblem, Solution, Status
+from lpv_track_env.bicycle import (
+    LOW_SPEED,
+    compiled_field,
+    compiled_inverse_speed,
+    fastest_pole,
+)
 from trajectories.arguments import Number, Whole, checks_arguments, instance_of, numbers
 from trajectories.compilation import compiled
 
@@ -39,15 +44,20 @@ PATIENCE = 8
 
 
 @compiled
-def roll_out_cost(stages: Array, lanes: Array, weights: Array, constants: Array) -> Float:
+def roll_out_cost(
+    stages: Array, lanes: Array, last_a: Float, last_delta: Float, weights: Array, constants: Array
+) -> Float:
     """Roll the inputs in the stages' STEP out, fill the slacks, and return the exact cost."""
-    p = constants
+    p, n = constants, lanes.shape[1]
+    lengths, most = L.grid(p, L.LENGTH, n), L.grid(p, L.SUBSTEPS, n)
     for k in range(2, L.POINT):
         stages[0, L.STEP_A + k] = stages[0, L.PLAN_A + k]
-    for i in range(lanes.shape[1]):
+    for i in range(n):
         e, end = stages[i], stages[i + 1]
         a, delta = e[L.STEP_A], e[L.STEP_DELTA]
-        following = linearisation.advance(linearisation.taken(e, L.STEP_VX), a, delta, p)
+        following = linearisation.advance(
+            linearisation.taken(e, L.STEP_VX), a, delta, lengths[i], most[i], p
+        )
         for k in range(6):
             end[L.STEP_VX + k] = following[k]
         rate = compiled_field(
@@ -59,13 +69,15 @@ def roll_out_cost(stages: Array, lanes: Array, weights: Array, constants: Array)
         lanes[L.SLACKS[0], i] = max(p[L.LOW_SPEED] - vx, vx - p[L.HIGH_SPEED], 0.0)
         lanes[L.SLACKS[1], i] = max(p[L.LOW_RATE] - rate, rate - p[L.HIGH_RATE], 0.0)
         lanes[L.SLACKS[2], i] = max(abs(vy) - p[L.RATIO] * vx, 0.0)
-    return rti.cost_of(stages, lanes, L.STEP_A, weights, constants)
+    return rti.cost_of(stages, lanes, L.STEP_A, last_a, last_delta, weights, constants)
 
 
 @compiled
-def cost_of_plan(stages: Array, lanes: Array, weights: Array, constants: Array) -> Float:
-    """Cost of the stages' NOW and of the slacks."""
-    return rti.cost_of(stages, lanes, L.NOW_A, weights, constants)
+def cost_of_plan(
+    stages: Array, lanes: Array, last_a: Float, last_delta: Float, weights: Array, constants: Array
+) -> Float:
+    """Cost of the stages' NOW and of the slacks, after the input (last_a, last_delta) in force."""
+    return rti.cost_of(stages, lanes, L.NOW_A, last_a, last_delta, weights, constants)
 
 
 @compiled
@@ -169,6 +181,13 @@ class RtiSolver:
         converged plan and keeps full Gauss-Newton steps from cycling.
     tolerance
         Mean product t lam and infeasibility at which a QP counts as solved.
+    preview_period
+        Spacing of the observations' preview, s, for `rti.control`; by default the first stage's
+        length.
+    steps_by_speed
+        Take as few Runge-Kutta steps a stage as resolve the lateral dynamics at its speed, instead
+        of those for the lowest permitted speed. The model is then not smooth in the speed, so only
+        single iterations make use of it.
 
     Raises
     ------
@@ -187,35 +206,39 @@ class RtiSolver:
         iterations: int = 1,
         damping: tuple[float, float] = DAMPING,
         tolerance: float = 1e-12,
+        preview_period: float | None = None,
+        steps_by_speed: bool = False,
     ) -> None:
         self.problem = instance_of("problem", problem, NmpcProblem, "an NmpcProblem")
         self.damping = numbers("damping", damping, Number(0.0, 1e9), INPUTS)
-        car, order = problem.vehicle, np.array(L.SLACK_OF)
-        first = problem.period if problem.first_period is None else problem.first_period
-        first_step, last_step = problem.input_steps[0], problem.input_steps[-1]
+        car, order, periods = problem.vehicle, np.array(L.SLACK_OF), problem.periods
+        first = periods[0] if problem.first_period is None else problem.first_period
         self.constants = np.array(
             [
                 *car.as_array(),
-                problem.period / problem.substeps,
-                problem.substeps,
-                problem.period,
-                min(first / problem.period, 1.0),
+                fastest_pole(LOW_SPEED, car) if steps_by_speed else 0.0,
+                periods[0] if preview_period is None else preview_period,
                 tolerance,
                 *np.concatenate(problem.input_bounds).astype(np.float32),
                 *car.acceleration_range,
                 car.max_steering_angle,
-                *last_step,
-                *first_step,
                 *car.speed_range,
                 *car.longitudinal_acceleration_range,
                 car.max_lateral_velocity_ratio,
                 *np.array(problem.linear_penalty)[order],
                 *np.array(problem.quadratic_penalty)[order],
                 *self.damping,
+                *periods,
+                *problem.substeps,
+                *(periods / NOMINAL_PERIOD),
+                *(1.0 / (problem.spacings * NOMINAL_PERIOD)),
+                *problem.input_steps.T.ravel(),
+                *np.minimum(first / periods, 1.0),
             ],
             dtype=np.float64,
         )
-        """As described in `layout`, (CONSTANTS_SIZE,)."""
+        """As described in `layout`, (CONSTANTS_SIZE + GRID N,)."""
+        self._shift = self.constants[-problem.horizon :]
         stages, lanes = L.working_space(problem.horizon, 1)
         self._stages, self._lanes = stages[0], lanes[0]
         self._stats = np.zeros(qp.STATS)
@@ -229,7 +252,7 @@ class RtiSolver:
         weights: Array,
         warm: Array | None = None,
     ) -> tuple[Solution, Array | None]:
-        """Solve from `state` (6,), with the input in force (2,) and the weights (10,).
+        """Solve from `state` (6,), with the input in force (2,) and the weights (12,).
 
         `reference` is (N + 1, 4). `warm` is the plan that the last solve returned, shifted here by
         one control period; without it the start is the input in force, held. Never raises: the
@@ -245,7 +268,7 @@ class RtiSolver:
             plan = np.tile(last, (n, 1))
         else:
             plan = warm.copy()
-            plan[:-1] += self.constants[L.SHIFT] * (plan[1:] - plan[:-1])
+            plan[:-1] += self._shift[:-1, None] * (plan[1:] - plan[:-1])
         given = state, last, reference, np.ascontiguousarray(weights, dtype=np.float64)
         if self._iterations == 1:
             self._prepare(state, plan, reference)
@@ -289,10 +312,11 @@ class RtiSolver:
 
     def _cost(self, inputs: Array, given: tuple[Array, Array, Array, Array]) -> float:
         """Exact cost of a plan; leaves its roll-out and slacks in the working space."""
-        state, _, reference, weights = given
+        state, last, reference, weights = given
         self._prepare(state, inputs, reference)
         self._stages[:-1, L.STEP_A : L.STEP_DELTA + 1] = inputs
-        return float(roll_out_cost(self._stages, self._lanes, weights, self.constants))
+        before = float(last[0]), float(last[1])
+        return float(roll_out_cost(self._stages, self._lanes, *before, weights, self.constants))
 
     def linearise(self, state: Array, inputs: Array) -> Linearisation:
         """Roll `inputs` (N, 2) out from `state` (6,) and linearise along the roll-out."""
@@ -323,7 +347,8 @@ class RtiSolver:
         seconds = time.perf_counter() - began
         if status is not Status.SUCCESS:
             return Solution(status, iterations=turns, seconds=seconds)
-        cost = cost_of_plan(self._stages, self._lanes, weights, self.constants)
+        before = float(last_input[0]), float(last_input[1])
+        cost = cost_of_plan(self._stages, self._lanes, *before, weights, self.constants)
         return Solution(
             status, self._inputs(), self._stages[:, L.NOW_VX : L.NOW_Y + 1].copy(),
             self._slack(), float(cost), turns, seconds,

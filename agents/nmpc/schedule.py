@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
+from agents.weights import HIGHEST, LOWEST, WEIGHTS, TrackingWeights, WeightSchedule
 from lpv_track_env.observation import PREVIEW_START
 from trajectories import CurvatureBands
 from trajectories.compilation import compiled, compiled_internal
 
 Array = NDArray[Any]
 
-WEIGHTS = 10
-"""Size of a set of weights: Q, S, R."""
 # Rules, (3 + bands - 1,): the bands' hysteresis, half width of blending, largest factor by which a
 # weight changes in a period, and the bands' thresholds from there on.
 HYSTERESIS, BLEND, LARGEST_FACTOR, THRESHOLDS = range(4)
@@ -33,13 +31,13 @@ def rules_of(bands: CurvatureBands, blend: float, slew: float, period: float) ->
 
 
 def one_set(weights: Array) -> tuple[Array, Array]:
-    """Return tables and rules of fixed weights, (10,) or (n, 10)."""
+    """Return tables and rules of fixed weights, (12,) or (n, 12)."""
     tables = np.array(np.atleast_2d(weights), dtype=np.float64)[:, None, :]
     return tables, np.array([0.0, 0.0, math.inf])
 
 
 def of_schedule(schedule: WeightSchedule, period: float) -> tuple[Array, Array]:
-    """Return tables (1, bands, 10) and rules of a schedule, for a control period (s)."""
+    """Return tables (1, bands, 12) and rules of a schedule, for a control period (s)."""
     sets = [weights.clipped().as_array() for weights in schedule.weights]
     slew = math.inf if schedule.slew is None else schedule.slew
     return np.array(sets)[None], rules_of(schedule.bands, schedule.blend, slew, period)
@@ -88,9 +86,9 @@ def update_band(observation: Array, steps: int, rules: Array, bands: Array, row:
 def choose_weights(
     observation: Array, steps: int, tables: Array, rules: Array, bands: Array, row: int, used: Array
 ) -> None:
-    """Move the weights in use, (10,), towards those of the preview's band, in place.
+    """Move the weights in use, (12,), towards those of the preview's band, in place.
 
-    `tables` is (bands, 10), clipped here to the bounds of weights. `used` is zero where an episode
+    `tables` is (bands, 12), clipped here to the bounds of weights. `used` is zero where an episode
     begins: the slew limit does not apply then. A preview that is not finite changes nothing.
     """
     curvature = sharpest(observation, steps)
@@ -125,7 +123,7 @@ def choose_weights(
 def choose_all(
     observations: Array, steps: int, tables: Array, rules: Array, bands: Array, used: Array
 ) -> None:
-    """`choose_weights` for rows of observations (n, size); `tables` (1 or n, bands, 10)."""
+    """`choose_weights` for rows of observations (n, size); `tables` (1 or n, bands, 12)."""
     for row in range(observations.shape[0]):
         own = row if tables.shape[0] > 1 else 0
         choose_weights(observations[row], steps, tables[own], rules, bands, row, used[row])
@@ -150,5 +148,5 @@ class Switching:
         )
 
     def choose(self, rows: Array, steps: int, bands: Array, used: Array) -> None:
-        """Update `used` (n, 10) and `bands` (n,) by observations (n, size)."""
+        """Update `used` (n, 12) and `bands` (n,) by observations (n, size)."""
         choose_all(rows, steps, self.tables, self.rules, bands, used)

@@ -26,7 +26,7 @@ from agents.weight_tuning.features import REJECTED
 from agents.weight_tuning.loop_kernels import finish_rows, prepare_rows
 from agents.weight_tuning.loop_memory import LoopMemory, LoopRow
 from agents.weight_tuning.policy import WeightPolicy, load
-from agents.weights import TrackingWeights, WeightSchedule, weights_from
+from agents.weights import WEIGHTS, TrackingWeights, WeightSchedule, weights_from
 from lpv_track_env.validation import forwards_arguments
 from trajectories.arguments import flag, shortened
 from trajectories.compilation import entry_point
@@ -117,7 +117,7 @@ class TunedNmpc:
         return {**self.__dict__, "_prepare": None, "_finish": None}
 
     def _new(self, rows: int) -> LoopMemory:
-        sets = np.zeros((1, 10)) if self._decider is None else self._decider.arrays.sets
+        sets = np.zeros((1, WEIGHTS)) if self._decider is None else self._decider.arrays.sets
         horizon, size = self.nmpc.problem.horizon, self.task.layout.size
         return LoopMemory(rows, horizon, size, self.future, sets)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from agents.learned.policy import checked_number
 from agents.nmpc.schedule import rules_of
 from agents.weight_tuning.features import LIMIT, TUNED, size
-from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
+from agents.weights import HIGHEST, LOWEST, WEIGHTS, TrackingWeights, WeightSchedule
 from trajectories import CurvatureBands
 from trajectories.compilation import compiled
 from trajectories.naming import choose
@@ -110,7 +110,7 @@ class WeightChoice:
 
     @property
     def sets(self) -> Array:
-        """Weights of the base, (bands, 10)."""
+        """Weights of the base, (bands, 12)."""
         return np.array([one.clipped().as_array() for one in self.schedule.weights])
 
     @property
@@ -134,8 +134,8 @@ class WeightChoice:
 
     @property
     def catalogue_sets(self) -> Array:
-        """Weights of the catalogue, (sets, 10)."""
-        return np.array([one.clipped().as_array() for one in self.catalogue]).reshape(-1, 10)
+        """Weights of the catalogue, (sets, 12)."""
+        return np.array([one.clipped().as_array() for one in self.catalogue]).reshape(-1, WEIGHTS)
 
 
 def observation_space(choice: WeightChoice) -> spaces.Box:
@@ -189,7 +189,7 @@ def weights_for(
     action: Array, band: int, sets: Array, matrix: Array, log_span: Any, catalogue: Array,
     chosen: Array,
 ) -> bool:  # fmt: skip
-    """Fill `chosen` (10,) with the weights that an action means in a band.
+    """Fill `chosen` (12,) with the weights that an action means in a band.
 
     `action` has entries that are clipped to [-1, 1]; or, with a catalogue, one entry per set, of
     which the largest chooses. Returns False, and fills nothing, if an entry is not finite.
@@ -221,7 +221,7 @@ def weights_for_all(
     actions: Array, mask: Array, bands: Array, sets: Array, matrix: Array, log_span: Any,
     catalogue: Array, tables: Array, refused: Array,
 ) -> None:  # fmt: skip
-    """Apply `weights_for` to the rows where `mask` is True, in `tables` (n, bands, 10).
+    """Apply `weights_for` to the rows where `mask` is True, in `tables` (n, bands, 12).
 
     `refused` (n,) becomes True for actions that are not finite.
     """

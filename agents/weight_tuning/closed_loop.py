@@ -24,6 +24,7 @@ from agents.reference import NODE
 from agents.weight_tuning import loop_kernels as loops
 from agents.weight_tuning.decision import NO_POLICY, Decider
 from agents.weight_tuning.loop_memory import LoopMemory
+from agents.weights import WEIGHTS
 from lpv_track_env import kernels as k
 from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.validation import checked_threads
@@ -97,7 +98,7 @@ class ClosedLoop:
     >>> envs = PathTrackingVectorEnv(64, "T2", autoreset_mode="Disabled", random_start=True)
     >>> loop = ClosedLoop(envs, agents.make("lpv-nmpc", envs.single))
     >>> loop.reset(seed=0)
-    >>> tally = loop.drive(20, weights)  # (64, 10), a set for each
+    >>> tally = loop.drive(20, weights)  # (64, 12), a set for each
     """
 
     def __init__(
@@ -131,7 +132,7 @@ class ClosedLoop:
             self.bands, self._rules = decider.choice.bands, decider.rules
         self.memory = LoopMemory(
             n, horizon, layout.size, future,
-            np.zeros((1, 10)) if decider is None else decider.arrays.sets,
+            np.zeros((1, WEIGHTS)) if decider is None else decider.arrays.sets,
         )  # fmt: skip
         self._threads = min(checked_threads(threads), n)
         many = shares(self._threads)
@@ -176,7 +177,7 @@ class ClosedLoop:
         periods
             At least 1.
         weights
-            Q, S, R: (10,) for all, (n, 10), or (n, bands, 10) where the loop has bands; by default
+            Q, S, R: (12,) for all, (n, 12), or (n, bands, 12) where the loop has bands; by default
             the agent's own weights or schedule. Rows with entries that are negative or not finite
             are refused, others are clipped to the bounds of weights.
         until_band
@@ -263,7 +264,7 @@ class ClosedLoop:
         self.memory.copy(rows, onto)
 
     def _checked_weights(self, weights: ArrayLike | None) -> tuple[Array, Array]:
-        """Return tables (1 or n, bands, 10) and the rules that choose a band."""
+        """Return tables (1 or n, bands, 12) and the rules that choose a band."""
         if weights is None and self._decider is not None:
             return self.memory.tables, self._rules
         if weights is None:
@@ -272,11 +273,13 @@ class ClosedLoop:
         n, count = self.envs.num_envs, len(self.bands)
         if values.ndim < 3:
             values = np.atleast_2d(values)
-        if values.shape in {(1, 10), (n, 10)}:
+        if values.shape in {(1, WEIGHTS), (n, WEIGHTS)}:
             values = np.repeat(values[:, None], count, axis=1)
-        if values.shape not in {(1, count, 10), (n, count, 10)}:
-            tables = f" or ({n}, {count}, 10)" if count > 1 else ""
-            raise ValueError(f"weights must be (10,) or ({n}, 10){tables}, not {np.shape(weights)}")
+        if values.shape not in {(1, count, WEIGHTS), (n, count, WEIGHTS)}:
+            tables = f" or ({n}, {count}, {WEIGHTS})" if count > 1 else ""
+            raise ValueError(
+                f"weights must be ({WEIGHTS},) or ({n}, {WEIGHTS}){tables}, not {np.shape(weights)}"
+            )
         bad = ~(np.isfinite(values) & (values >= 0.0)).all(axis=(1, 2))
         if bad.any():
             row = int(np.argmax(bad))

@@ -20,6 +20,7 @@ from agents.weight_tuning.features import (
     size,
 )
 from agents.weight_tuning.loop_memory import LoopMemory
+from agents.weights import WEIGHTS
 from trajectories.compilation import compiled_internal
 
 Array = NDArray[Any]
@@ -34,13 +35,13 @@ class PolicyArrays(NamedTuple):
     layers: NDArray[np.int64]
     """Start in `network`, inputs, outputs, activation of each layer; (0, 4) without a policy."""
     sets: Array
-    """Base weights of each band, (bands, 10)."""
+    """Base weights of each band, (bands, 12)."""
     matrix: Array
     """Directions in which an action moves Q and S, (8, entries)."""
     log_span: float
     """Logarithm of the factor that an action of 1 multiplies by."""
     catalogue: Array
-    """Sets to choose from, (entries, 10); (0, 10) where an action multiplies."""
+    """Sets to choose from, (entries, 12); (0, 12) where an action multiplies."""
     scales: Array
     """Scales of the history's statistics, (STATISTICS,)."""
     window: int
@@ -48,8 +49,8 @@ class PolicyArrays(NamedTuple):
 
 
 NO_POLICY = PolicyArrays(
-    np.zeros(0, dtype=np.float32), np.zeros((0, 4), dtype=np.int64), np.ones((1, 10)),
-    np.zeros((8, 1)), 1.0, np.zeros((0, 10)), SCALES, 1,
+    np.zeros(0, dtype=np.float32), np.zeros((0, 4), dtype=np.int64), np.ones((1, WEIGHTS)),
+    np.zeros((8, 1)), 1.0, np.zeros((0, WEIGHTS)), SCALES, 1,
 )  # fmt: skip
 """Stands in where no policy decides."""
 
@@ -111,7 +112,7 @@ class Decider:
 def decide_if_due(
     o: Array, h: Array, in_use: Array, band: int, policy: PolicyArrays, table: Array, work: Array
 ) -> None:
-    """Let a policy choose the weights of the present band, a row of `table` (bands, 10), if due.
+    """Let a policy choose the weights of the present band, a row of `table` (bands, 12), if due.
 
     A decision is due in an episode's first period, after a whole window, and in another band. An
     output that is not finite leaves the weights as they are and is counted. `work` (2, widest)

@@ -79,7 +79,7 @@ class WeightTuningEnv(gymnasium.Env[NDArray[np.float32], Any]):
     ## Infos
 
     `parts` (5,) of the window's score; its `steps`, `solves` and `failures`; the `band` of the next
-    action; `weights` (10,) in use, zeros before the first window; the numbers of `rejected` and
+    action; `weights` (12,) in use, zeros before the first window; the numbers of `rejected` and
     `clipped` actions in the episode; and where it ended, its `end` and `score`.
 
     ## Arguments

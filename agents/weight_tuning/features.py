@@ -204,7 +204,7 @@ def fill_features(
 ) -> None:
     """Fill the features `x` (size,) for an observation `o` and the row `h` of its drive's history.
 
-    `used` (10,) are the weights in use, zeros before the first choice; `base` (bands, 10) those
+    `used` (12,) are the weights in use, zeros before the first choice; `base` (bands, 12) those
     that an action multiplies; `band` may be -1.
     """
     steps = (o.shape[0] - PREVIEW_START) // 2

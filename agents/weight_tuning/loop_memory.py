@@ -34,13 +34,13 @@ class WeightArrays(NamedTuple):
     """Weights of n vehicles and the rules that choose them, for compiled code."""
 
     tables: Array
-    """Weights of each band, (n, bands, 10), or (1, bands, 10) for all vehicles."""
+    """Weights of each band, (n, bands, 12), or (1, bands, 12) for all vehicles."""
     rules: Array
     """Rules of switching, see `agents.nmpc.schedule`."""
     bands: Array
     """Present band of each vehicle, (n,)."""
     in_use: Array
-    """Weights of the last solve, (n, 10), zeros before the first."""
+    """Weights of the last solve, (n, 12), zeros before the first."""
 
 
 class LoopMemory:
@@ -57,7 +57,7 @@ class LoopMemory:
     future
         Delay compensation, if any.
     sets
-        Weights of each band that a weight policy starts from, (bands, 10).
+        Weights of each band that a weight policy starts from, (bands, 12).
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class LoopMemory:
         self.foot_points = np.zeros((rows, FOOT))
         self.history = np.zeros((rows, HISTORY))
         self.tables = np.tile(sets, (rows, 1, 1))
-        """Weights of each band that a weight policy has chosen, (n, bands, 10)."""
+        """Weights of each band that a weight policy has chosen, (n, bands, 12)."""
         self.shape = (horizon, size, self.commands.shape[1], *self.tables.shape[1:])
         self._delays = np.zeros(0) if future is None else future.settings
         self._sets = sets

@@ -38,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_control_period(parser, 0.05)
     parser.add_argument("--preview-steps", type=PREVIEW_STEPS, default=20, metavar="K")
     parser.add_argument(
-        "--preview-period", type=PREVIEW_PERIOD, metavar="S", help="default: the control period"
+        "--preview-period", type=PREVIEW_PERIOD, metavar="S", default=0.1, help="default: 0.1"
     )
 
 
@@ -66,10 +66,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     vehicle = load(options.vehicle)
     period = options.control_period
-    layout = ObservationLayout(
-        options.preview_steps,
-        period if options.preview_period is None else options.preview_period,
-    )
+    layout = ObservationLayout(options.preview_steps, options.preview_period)
     digest = file_digest(options.model) if options.model.is_file() else ""
     model = load_trusted(options.model, options.algorithm)
     training = {

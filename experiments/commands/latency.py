@@ -37,7 +37,6 @@ Spec = dict[str, Any]
 
 PERIOD = 0.02
 """Control period of the paper (50 Hz), s."""
-ENV = {"preview_period": 0.05}
 AGENT = "lpv-nmpc"
 SOLVERS = ("lpv-nmpc", "lpv-nmpc-ipopt")
 MAILBOX = 1e-4
@@ -119,7 +118,7 @@ def record(trajectory: str, steps: int = RECORDED_STEPS) -> dict[str, list[float
     for name in SOLVERS:
         case = Case(
             agent=name, trajectory=trajectory, control_period=PERIOD, conditions="realtime",
-            env_settings={**ENV, "time_limit": steps * PERIOD},
+            env_settings={"time_limit": steps * PERIOD},
         )  # fmt: skip
         env = case.make_env()
         driven = rollout(env, case.make_agent(env), seed=0)
@@ -185,7 +184,7 @@ def specs_of(
                 clocks[SLOWER_CLOCK] = periods * PERIOD
             for name, period in clocks.items():
                 cells[label, name] = grid(
-                    (AGENT,), trajectories, seeds=seeds, control_period=period, env_settings=ENV,
+                    (AGENT,), trajectories, seeds=seeds, control_period=period,
                     conditions={"name": "realtime", "computing_delay": delay}, computing=computing,
                 )  # fmt: skip
     return cells

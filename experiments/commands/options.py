@@ -98,7 +98,7 @@ def add_job(parser: argparse.ArgumentParser, folder: str) -> None:
     parser.add_argument("--preview-steps", type=PREVIEW_STEPS, metavar="K", help="default 20")
     parser.add_argument(
         "--preview-period", type=PREVIEW_PERIOD, metavar="S",
-        help="s (default: the control period)",
+        help="s (default 0.1)",
     )  # fmt: skip
 
 

@@ -26,8 +26,6 @@ STEP = 1.0 / MS_PER_SECOND
 """Cycle of the simulated vehicle, s: integration step, and grid on which commands take effect."""
 INERTIAL_MS, WHEEL_MS = 10, 20
 """Time between readings, ms: IMU and heading at 100 Hz, wheels at 50 Hz."""
-PREVIEW_PERIOD, PREVIEW_STEPS = 0.05, 20
-"""Preview of agents, s and nodes: one second ahead, whatever the rate."""
 ESTIMATORS = ("ekf", "truth")
 
 SAMPLE = np.dtype(
@@ -188,7 +186,7 @@ class Setup:
         return load(self.conditions) or IDEAL
 
     def task_env(self) -> PathTrackingEnv:
-        """Return an environment with the path, vehicle, period, preview and known delays.
+        """Return an environment with the path, vehicle, period and known delays.
 
         It simulates no computing delay: the processes of a run have a real one.
         """
@@ -198,6 +196,4 @@ class Setup:
             self.vehicle,
             conditions=conditions.replace(computing_delay=0.0) if conditions else SIMULATION,
             control_period=self.period,
-            preview_steps=PREVIEW_STEPS,
-            preview_period=PREVIEW_PERIOD,
         )

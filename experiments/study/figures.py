@@ -103,7 +103,7 @@ def _offset(k: int, count: int) -> float:
 
 
 def weights_in_use(result: Result, given: EvaluationSet) -> tuple[Array, Array]:
-    """Return the weights (m, 10) and bands (m,) of the windows of some drives."""
+    """Return the weights (m, 12) and bands (m,) of the windows of some drives."""
     used, bands = [], []
     for path in given.trajectories[:6]:
         loop = loop_with(result, given.environments(path))

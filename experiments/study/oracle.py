@@ -23,6 +23,7 @@ from agents.weight_tuning.closed_loop import ClosedLoop, Tally
 from agents.weight_tuning.policy import load
 from agents.weight_tuning.score import failed, parts_of, scores_of
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
+from agents.weights import WEIGHTS as SET_SIZE
 from experiments.study.evaluation import EvaluationSet
 from experiments.study.study import Study
 from experiments.tuning.loop import WEIGHTS
@@ -89,14 +90,14 @@ def study_oracles(
 
 
 def pool_of(count: int, found: Sequence[TrackingWeights], seed: int = 0) -> Array:
-    """Return sets of weights (sets, 10): default, `found` by tunings, a Sobol sequence in the span.
+    """Return sets of weights (sets, 12): default, `found` by tunings, a Sobol sequence in the span.
 
     `count` is the length of the sequence, a power of two, and `seed` the seed of its scrambling.
     """
     limit = np.log(SPAN)
     points = qmc.Sobol(DIRECTIONS["stages"].shape[1], seed=seed).random(count)
     drawn = weights_at(limit * (2.0 * points - 1.0), "stages", SPAN)
-    given = np.array([one.as_array() for one in found]).reshape(-1, 10)
+    given = np.array([one.as_array() for one in found]).reshape(-1, SET_SIZE)
     base = TrackingWeights().as_array()
     pool: Array = np.clip(np.vstack([base, given, drawn]), LOWEST, HIGHEST)
     return pool
@@ -209,7 +210,7 @@ def greedy(
 ) -> Iterator[Array]:
     """Yield scores (seeds,) of a greedy oracle on each path of a set.
 
-    Every `window` periods it tries each set of the pool (sets, 10) over `ahead` windows on a copy
+    Every `window` periods it tries each set of the pool (sets, 12) over `ahead` windows on a copy
     of the drive, and takes the best one for one window.
     """
     count = len(pool)

@@ -72,7 +72,7 @@ class Arm:
         }  # fmt: skip
 
     def draw(self, rng: np.random.Generator, count: int, base: Array) -> Array:
-        """Draw sets of weights (count, 10) around the base (10,)."""
+        """Draw sets of weights (count, 12) around the base (12,)."""
         sets = np.tile(base, (count, 1))
         if self.mode == CONTROL:
             return sets

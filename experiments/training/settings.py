@@ -12,6 +12,7 @@ from agents.learned.policy import ACTIVATIONS, ORIGINS
 from experiments.jobs.job import check_paths, plain_values
 from experiments.training import ALGORITHMS
 from lpv_track_env import conditions, vehicle
+from lpv_track_env.observation import PREVIEW_PERIOD, PREVIEW_STEPS
 from lpv_track_env.reward import RewardWeights
 from trajectories.arguments import shown
 from trajectories.naming import choose
@@ -98,8 +99,8 @@ class TrainingSettings:
     vehicle: str = "m2-minibus"
     conditions: tuple[Any, ...] = ("simulation", "realtime")
     control_period: float = 0.05
-    preview_steps: int = 20
-    preview_period: float | None = None
+    preview_steps: int = PREVIEW_STEPS
+    preview_period: float = PREVIEW_PERIOD
     trajectories: tuple[str, ...] = ()
     paths: int = 48
     validation: int = 6

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.weight_tuning.choice import DIRECTIONS
-from agents.weights import WeightSchedule
+from agents.weights import WEIGHTS, WeightSchedule
 from experiments.tuning.settings import TuningSettings
 from experiments.tuning.tuner import Tuner, TuningDrives, schedule_of, unusable, weights_at
 from trajectories import CurvatureBands, ReferencePath
@@ -137,7 +137,7 @@ class Search(ReplayedTuner):
         """Present estimate of the optimum, (rows, entries)."""
 
     def weights_of(self, point: Array) -> Array:
-        """Return the weights (..., 10) of points (..., entries)."""
+        """Return the weights (..., 12) of points (..., entries)."""
         return weights_at(point, self.settings.directions, self.settings.span)
 
     def step(self) -> dict[str, float]:
@@ -151,7 +151,7 @@ class Search(ReplayedTuner):
     def result(self, provenance: Mapping[str, Any]) -> WeightSchedule:
         """Return a schedule with a set for every band; with one row, all sets are the same."""
         sets = self.weights_of(self.point)
-        return schedule_of(np.broadcast_to(sets, (len(CurvatureBands()), 10)), provenance)
+        return schedule_of(np.broadcast_to(sets, (len(CurvatureBands()), WEIGHTS)), provenance)
 
 
 class CmaSearch(Search):
@@ -207,7 +207,7 @@ class CmaSearch(Search):
         for point in points:
             table = self.weights_of(point.reshape(self.rows, self.entries))
             count = len(self.drives.bands)
-            tables = np.broadcast_to(table, (count, 10))[None]
+            tables = np.broadcast_to(table, (count, WEIGHTS))[None]
             scores.append(float(self.drives.scores(tables, number).mean()))
         self._solves += self.drives.solves - before
         return scores
@@ -251,7 +251,7 @@ class GradientSearch(Search):
         before = self.drives.solves
         seeds = self.drives.seeds(number)
         scores = self.drives.scores(
-            np.broadcast_to(tables, (len(points), count, 10)),
+            np.broadcast_to(tables, (len(points), count, WEIGHTS)),
             number,
             [seeds[k // 2] for k in range(len(points))],
         )

@@ -11,6 +11,7 @@ from experiments.jobs.job import check_paths, plain_values
 from experiments.training.settings import LEAST, MOST
 from experiments.tuning import METHODS
 from lpv_track_env import conditions, vehicle
+from lpv_track_env.observation import PREVIEW_PERIOD, PREVIEW_STEPS
 from trajectories.arguments import shown
 from trajectories.naming import choose
 
@@ -74,8 +75,8 @@ class TuningSettings:
     vehicle: str = "m2-minibus"
     conditions: Any = "randomised"
     control_period: float = 0.05
-    preview_steps: int = 20
-    preview_period: float | None = None
+    preview_steps: int = PREVIEW_STEPS
+    preview_period: float = PREVIEW_PERIOD
     trajectories: tuple[str, ...] = ()
     paths: int = 32
     drives: int = 16

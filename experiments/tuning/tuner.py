@@ -15,7 +15,7 @@ from agents.weight_tuning.choice import DIRECTIONS, SLEW, WeightChoice
 from agents.weight_tuning.closed_loop import ClosedLoop
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weight_tuning.score import scores_of
-from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
+from agents.weights import HIGHEST, LOWEST, WEIGHTS, TrackingWeights, WeightSchedule
 from experiments.jobs.job import PROGRESS, Job, Line, episode_seed, read_lines
 from experiments.tuning.settings import TuningSettings
 from lpv_track_env import vehicle
@@ -112,12 +112,12 @@ def lines_until(solves: int, folder: Path) -> list[Line]:
 
 
 def weights_at(point: Array, directions: str, span: float) -> Array:
-    """Return weights (..., 10) at log-multipliers (..., entries) of the default ones.
+    """Return weights (..., 12) at log-multipliers (..., entries) of the default ones.
 
     Multipliers are clipped to `span` in either direction.
     """
     matrix = DIRECTIONS[directions]
-    weights = np.broadcast_to(TrackingWeights().as_array(), (*point.shape[:-1], 10)).copy()
+    weights = np.broadcast_to(TrackingWeights().as_array(), (*point.shape[:-1], WEIGHTS)).copy()
     limit = np.log(span)
     weights[..., :8] *= np.exp(np.clip(point, -limit, limit) @ matrix.T)
     return np.clip(weights, LOWEST, HIGHEST)
@@ -150,7 +150,7 @@ def choice_of(settings: TuningSettings) -> WeightChoice:
 
 
 def schedule_of(rows: Array, provenance: Mapping[str, Any]) -> WeightSchedule:
-    """Return a schedule with a set (10,) for every band of curvature, (bands, 10)."""
+    """Return a schedule with a set (12,) for every band of curvature, (bands, 12)."""
     return WeightSchedule(
         CurvatureBands(), tuple(TrackingWeights.from_array(row) for row in rows), slew=SLEW,
         provenance=provenance,
@@ -200,7 +200,7 @@ class TuningDrives:
         return [first + k for k in range(self.envs.num_envs)]
 
     def scores(self, tables: Array, number: int, seeds: Sequence[int] | None = None) -> Array:
-        """Return scores (n,) of round `number` under weights (10,), (n, 10) or (1 or n, bands, 10).
+        """Return scores (n,) of round `number` under weights (12,), (n, 12) or (1 or n, bands, 12).
 
         `seeds` replace those of the round.
         """

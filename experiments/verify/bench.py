@@ -58,7 +58,7 @@ class Situation:
     reference: Array
     """(N + 1, 4)."""
     weights: Array
-    """(10,)."""
+    """(12,)."""
     inputs: Array
     """(N, 2), within all hard bounds."""
 

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from agents.nmpc.casadi_solvers import discrete_model, lpv_field
+from agents.nmpc.casadi_solvers import lpv_field, stage_models
 from agents.nmpc.linearisation import Linearisation
-from agents.nmpc.problem import INPUTS, SOFT, STATES, NmpcProblem
+from agents.nmpc.problem import INPUTS, NOMINAL_PERIOD, SOFT, STATES, NmpcProblem
 from lpv_track_env import lpv
 from lpv_track_env.bicycle import PSI, VX, VY, X, Y, derivative
 
@@ -35,11 +35,12 @@ class PlanCost(NamedTuple):
 
 def rolled_out(problem: NmpcProblem, state: Array, inputs: Array) -> Array:
     """Return the states (N + 1, 6) of inputs (N, 2) from a state (6,), by classic Runge-Kutta."""
-    h, car = problem.period / problem.substeps, problem.vehicle
+    car = problem.vehicle
     states = np.empty((len(inputs) + 1, len(state)))
     states[0] = x = np.asarray(state, dtype=np.float64)
     for i, u in enumerate(inputs):
-        for _ in range(problem.substeps):
+        h = problem.periods[i] / problem.substeps[i]
+        for _ in range(problem.substeps[i]):
             k1 = derivative(x, u, car)
             k2 = derivative(x + 0.5 * h * k1, u, car)
             k3 = derivative(x + 0.5 * h * k2, u, car)
@@ -63,10 +64,14 @@ def plan_cost(
     optimal plan equals the solver's objective.
     """
     x, car = rolled_out(problem, state, inputs), problem.vehicle
-    q, s, r = weights[:4], weights[4:8], weights[8:]
+    q, s, r, r_rate = np.split(weights, (4, 8, 10))
+    share = problem.periods[:, None] / NOMINAL_PERIOD
     error = reference - x[:, [VX, PSI, X, Y]]
-    tracking = 0.5 * np.sum(error[:-1] ** 2 * q) + 0.5 * np.sum(error[-1] ** 2 * s)
-    effort = 0.5 * np.sum(inputs**2 * r)
+    tracking = 0.5 * np.sum(share * error[:-1] ** 2 * q) + 0.5 * np.sum(error[-1] ** 2 * s)
+    effort = 0.5 * np.sum(share * inputs**2 * r)
+    steps = np.diff(np.vstack([last_input, inputs]), axis=0)
+    spacing = problem.spacings[:, None]
+    effort += 0.5 * np.sum(spacing / NOMINAL_PERIOD * (steps / spacing) ** 2 * r_rate)
 
     slow, fast = car.speed_range
     braking, driving = car.longitudinal_acceleration_range
@@ -78,11 +83,10 @@ def plan_cost(
         np.maximum(braking - rate, rate - driving),
     ]
     slack = np.maximum(np.column_stack(beyond), 0.0)
-    penalty = np.sum(slack * problem.linear_penalty)
-    penalty += 0.5 * np.sum(slack**2 * problem.quadratic_penalty)
+    penalty = np.sum(share * slack * problem.linear_penalty)
+    penalty += 0.5 * np.sum(share * slack**2 * problem.quadratic_penalty)
 
     low, high = problem.input_bounds
-    steps = np.diff(np.vstack([last_input, inputs]), axis=0)
     over = [low - inputs, inputs - high, np.abs(steps) - problem.input_steps]
     excess = max(0.0, *(float(values.max()) for values in over))
     return PlanCost(float(tracking + effort + penalty), slack, excess)
@@ -93,13 +97,16 @@ class CasadiDerivatives:
 
     def __init__(self, problem: NmpcProblem) -> None:
         x, u = ca.SX.sym("x", STATES), ca.SX.sym("u", INPUTS)
-        following, rate = discrete_model(problem)(x, u), lpv_field(x, u, problem)[0]
-        outputs = [
-            expression
-            for value in (following, rate)
-            for expression in (value, ca.jacobian(value, x), ca.jacobian(value, u))
-        ]
-        self._function = ca.Function("derivatives", [x, u], outputs)
+        rate = lpv_field(x, u, problem)[0]
+        made: dict[float, ca.Function] = {}
+        for length, model in zip(problem.periods, stage_models(problem), strict=True):
+            outputs = [
+                expression
+                for value in (model(x, u), rate)
+                for expression in (value, ca.jacobian(value, x), ca.jacobian(value, u))
+            ]
+            made[length] = ca.Function("derivatives", [x, u], outputs)
+        self._functions = [made[length] for length in problem.periods]
 
     def along(self, state: Array, inputs: Array) -> Linearisation:
         """Roll the inputs (N, 2) out from a state (6,) and differentiate at every step."""
@@ -114,7 +121,7 @@ class CasadiDerivatives:
         )
         result.states[0] = state
         for i, u in enumerate(inputs):
-            values = [np.asarray(value) for value in self._function(result.states[i], u)]
+            values = [np.asarray(value) for value in self._functions[i](result.states[i], u)]
             result.states[i + 1] = values[0].ravel()
             result.A[i], result.B[i], result.rate[i] = values[1], values[2], values[3].item()
             result.rate_x[i], result.rate_u[i] = values[4].ravel(), values[5].ravel()
@@ -169,7 +176,7 @@ class PiqpOracle:
 
         Returns None if PIQP does not reach `TOLERANCE` and `GAP`.
         """
-        hessian, gradient = self._objective(reference, weights, inputs)
+        hessian, gradient = self._objective(last_input, reference, weights, inputs)
         equal, equal_to = self._dynamics(inputs, along)
         rows, low, high = self._constraints(last_input, inputs, along)
         lower, upper = self._bounds()
@@ -186,20 +193,30 @@ class PiqpOracle:
         plan: Array = solver.result.x.reshape(-1, STAGE)[:, :INPUTS]
         return plan.copy()
 
-    def _objective(self, reference: Array, weights: Array, inputs: Array) -> tuple[Array, Array]:
+    def _objective(
+        self, last_input: Array, reference: Array, weights: Array, inputs: Array
+    ) -> tuple[Array, Array]:
         """Return Hessian (n, n) and gradient (n,)."""
-        n = self.problem.horizon
-        q, s, r = weights[:4], weights[4:8], weights[8:]
+        n, shares = self.problem.horizon, self.problem.periods / NOMINAL_PERIOD
+        q, s, r, r_rate = np.split(weights, (4, 8, 10))
         hessian, gradient = np.zeros((n * STAGE, n * STAGE)), np.zeros(n * STAGE)
         for i in range(n):
             u, slack, x = _stage(i)
-            outputs = s if i == n - 1 else q
-            hessian[u, u] = np.diag(r + self.damping)
-            hessian[slack, slack] = np.diag(self.problem.quadratic_penalty)
+            outputs = s if i == n - 1 else q * shares[i + 1]
+            hessian[u, u] += np.diag(r * shares[i] + self.damping)
+            hessian[slack, slack] = np.diag(self.problem.quadratic_penalty) * shares[i]
             hessian[x, x] = lpv.C.T @ np.diag(outputs) @ lpv.C
-            gradient[u] = -self.damping * inputs[i]
-            gradient[slack] = self.problem.linear_penalty
+            gradient[u] += -self.damping * inputs[i]
+            gradient[slack] = np.array(self.problem.linear_penalty) * shares[i]
             gradient[x] = -lpv.C.T @ (outputs * reference[i + 1])
+            price = r_rate / (self.problem.spacings[i] * NOMINAL_PERIOD)
+            hessian[u, u] += np.diag(price)
+            if i == 0:
+                gradient[u] -= price * last_input
+            else:
+                before = _stage(i - 1)[0]
+                hessian[before, before] += np.diag(price)
+                hessian[u, before] = hessian[before, u] = -np.diag(price)
         return hessian, gradient
 
     def _dynamics(self, inputs: Array, along: Linearisation) -> tuple[Array, Array]:

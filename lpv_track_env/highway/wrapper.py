@@ -17,7 +17,7 @@ from lpv_track_env.estimation.observer import PathObserver
 from lpv_track_env.highway.cruise import CruiseControl
 from lpv_track_env.highway.routes import lane_route, reference_path, road_ahead
 from lpv_track_env.highway.traffic import TrafficReference, others_on
-from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.observation import PREVIEW_STEPS, ObservationLayout
 from lpv_track_env.task import action_space
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
@@ -108,7 +108,7 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
     speed_limits
         Speed limits of the reference.
     preview_steps
-        Number K of preview steps, each of a control period.
+        Number K of preview steps, each of 0.1 s.
 
     Raises
     ------
@@ -123,7 +123,7 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         *,
         cruise: CruiseControl | None = CruiseControl(),  # noqa: B008  frozen
         speed_limits: SpeedLimits = LIMITS,
-        preview_steps: int = 20,
+        preview_steps: int = PREVIEW_STEPS,
     ) -> None:
         super().__init__(env)
         inner = env.unwrapped
@@ -131,7 +131,7 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise ValueError(f"{type(inner).__name__} is not an environment of highway-env")  # noqa: TRY004
         self.highway, self.vehicle = inner, vehicle_of(inner)
         self.control_period = 1.0 / inner.config["policy_frequency"]
-        self.layout = ObservationLayout(preview_steps, self.control_period)
+        self.layout = ObservationLayout(preview_steps)
         self.actuation = Actuation()
         self.route = None if route is None else tuple(route)
         self._throttle = bool(inner.action_type.longitudinal)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.nmpc.linearisation import Linearisation
-from agents.nmpc.problem import NmpcProblem
+from agents.nmpc.problem import NOMINAL_PERIOD, NmpcProblem
 from lpv_track_env.bicycle import PSI, VX, VY, X, Y
 from tests.helpers.nmpc_situations import Situation
 
@@ -38,13 +38,19 @@ class CondensedQp:
             influence[i + 1] = along.A[i] @ influence[i]
             influence[i + 1][:, 2 * i : 2 * i + 2] += along.B[i]
         weights = situation.weights
-        prices = np.concatenate([np.tile(weights[:4], n), weights[4:8]])
-        effort = np.tile(weights[8:], n)
+        share = problem.periods / NOMINAL_PERIOD
+        prices = np.concatenate([np.outer(share, weights[:4]).ravel(), weights[4:8]])
+        effort = np.outer(share, weights[8:10]).ravel()
+        change = np.eye(2 * n) - np.eye(2 * n, k=-2)
+        smooth = np.outer(1.0 / (problem.spacings * NOMINAL_PERIOD), weights[10:]).ravel()
+        before = np.concatenate([situation.last_input, np.zeros(2 * n - 2)])
         outputs = influence[:, OUTPUTS].reshape(-1, 2 * n)
         error = (along.states[:, OUTPUTS] - situation.reference).ravel()
         self.hessian = outputs.T @ (prices[:, None] * outputs)
         self.hessian += np.diag(effort + np.tile(damping, n))
+        self.hessian += change.T @ (smooth[:, None] * change)
         self.gradient = outputs.T @ (prices * error) + effort * plan
+        self.gradient += change.T @ (smooth * (change @ plan - before))
 
         (slow, fast), ratio = car.speed_range, car.max_lateral_velocity_ratio
         braking, driving = car.longitudinal_acceleration_range
@@ -59,8 +65,8 @@ class CondensedQp:
                 along.rate - braking, driving - along.rate,
             ]
         )  # fmt: skip
-        self.linear = np.repeat(problem.linear_penalty, 2 * n)
-        self.quadratic = np.repeat(problem.quadratic_penalty, 2 * n)
+        self.linear = np.outer(problem.linear_penalty, np.tile(share, 2)).ravel()
+        self.quadratic = np.outer(problem.quadratic_penalty, np.tile(share, 2)).ravel()
 
     def slack(self, inputs: Array) -> Array:
         """Least slack (N, 3) on (vx, vy, vx')."""

@@ -9,7 +9,7 @@ from agents.nmpc.problem import NmpcProblem
 from agents.weights import TrackingWeights
 
 Array = NDArray[np.float64]
-WEIGHTS = TrackingWeights().as_array()
+WEIGHTS = TrackingWeights(R_rate=(0.002, 0.2)).as_array()
 MIRROR_STATE = np.array([1.0, -1.0, -1.0, -1.0, 1.0, -1.0])
 MIRROR_INPUT = np.array([1.0, -1.0])
 MIRROR_OUTPUT = np.array([1.0, -1.0, 1.0, -1.0])
@@ -26,7 +26,7 @@ class Situation(NamedTuple):
 
     @property
     def parameters(self) -> tuple[Array, Array, Array, Array]:
-        """State (6,), last input (2,), reference (N + 1, 4), weights (10,)."""
+        """State (6,), last input (2,), reference (N + 1, 4), weights (12,)."""
         return self.state, self.last_input, self.reference, self.weights
 
     @property
@@ -41,8 +41,11 @@ class Situation(NamedTuple):
         )
 
 
-def arc(curvature: float, speeds: Array, period: float) -> Array:
-    """Reference (N + 1, 4) [vx, psi, X, Y] along an arc from the origin, at speeds (N + 1,)."""
+def arc(curvature: float, speeds: Array, period: float | Array) -> Array:
+    """Reference (N + 1, 4) [vx, psi, X, Y] along an arc from the origin, at speeds (N + 1,).
+
+    `period` (s) is the time from node to node, one for all or (N,).
+    """
     lengths = 0.5 * (speeds[1:] + speeds[:-1]) * period
     s = np.concatenate([[0.0], np.cumsum(lengths)])
     half = 0.5 * curvature * s
@@ -74,24 +77,20 @@ def hard(
         ]
     )
     low, high = problem.input_bounds
-    low[0] = max(low[0], (1.0 - vx) / (n * problem.period) + car.rolling_deceleration)
+    low[0] = max(low[0], (1.0 - vx) / problem.times[-1] + car.rolling_deceleration)
     last = np.array([errors * rng.uniform(low[0], high[0]), car.wheelbase * curvature]).clip(
         low, high
     )
     if vx < 5.0 and errors >= 1.0:
         last[1] = rng.uniform(low[1], high[1])
-    speeds = (
-        vx
-        + errors * rng.normal(0.0, 1.0)
-        + rng.uniform(-1.5, 1.5) * problem.period * np.arange(n + 1)
-    )
+    speeds = vx + errors * rng.normal(0.0, 1.0) + rng.uniform(-1.5, 1.5) * problem.times
     inputs, before = np.empty((n, 2)), last
     for i, step in enumerate(problem.input_steps):
         inputs[i] = before = (before + rng.uniform(-1.0, 1.0, 2) * step).clip(low, high)
     return Situation(
         state,
         last,
-        arc(curvature, np.maximum(speeds, 0.5), problem.period),
+        arc(curvature, np.maximum(speeds, 0.5), problem.periods),
         WEIGHTS * 10.0 ** rng.uniform(-decades, decades, len(WEIGHTS)),
         inputs,
     )

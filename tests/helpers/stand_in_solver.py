@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.nmpc.casadi_solvers import FatropSolver
-from agents.nmpc.problem import NmpcProblem, Solution, Status
+from agents.nmpc.problem import NOMINAL_PERIOD, NmpcProblem, Solution, Status
 from lpv_track_env.bicycle import derivative
 
 Array = NDArray[np.float64]
@@ -27,8 +27,8 @@ class StandIn:
 
     def step(self, states: Array, inputs: Array) -> Array:
         """Integrate states (6, n) with inputs (2, n) over one period."""
-        h, car = self.problem.period / self.problem.substeps, self.problem.vehicle
-        for _ in range(self.problem.substeps):
+        h, car = self.problem.period / self.problem.substeps[0], self.problem.vehicle
+        for _ in range(self.problem.substeps[0]):
             k1 = derivative(states, inputs, car)
             k2 = derivative(states + h / 2 * k1, inputs, car)
             k3 = derivative(states + h / 2 * k2, inputs, car)
@@ -74,22 +74,28 @@ class StandIn:
             influence[i + 1] = along.A[i] @ influence[i]
             influence[i + 1][:, 2 * i : 2 * i + 2] = along.B[i]
         outputs = influence[1:][:, OUTPUTS].reshape(4 * n, 2 * n)
-        prices = np.concatenate([np.tile(weights[:4], n - 1), weights[4:8]])
-        effort = np.tile(weights[8:], n)
-        error = (reference[1:] - along.states[1:][:, OUTPUTS]).ravel()
-        moves = outputs.T @ (prices[:, None] * outputs)
-        moves += np.diag(effort + np.tile(self.damping, n))
-        hessian = np.zeros((5 * n, 5 * n))
-        hessian[: 2 * n, : 2 * n] = moves
-        hessian[2 * n :, 2 * n :] = np.diag(np.tile(problem.quadratic_penalty, n))
-        gradient = np.concatenate(
-            [effort * inputs.ravel() - outputs.T @ (prices * error),
-             np.tile(problem.linear_penalty, n)]
-        )  # fmt: skip
-
+        share = problem.period / NOMINAL_PERIOD
+        prices = np.concatenate([np.tile(share * weights[:4], n - 1), weights[4:8]])
+        effort = share * np.tile(weights[8:10], n)
+        smooth = np.outer(1.0 / (problem.spacings * NOMINAL_PERIOD), weights[10:]).ravel()
         unit = np.eye(2 * n)
         change = unit - np.vstack([np.zeros((2, 2 * n)), unit[:-2]])
         before = np.vstack([last_input, inputs[:-1]])
+        error = (reference[1:] - along.states[1:][:, OUTPUTS]).ravel()
+        moves = outputs.T @ (prices[:, None] * outputs)
+        moves += np.diag(effort + np.tile(self.damping, n))
+        moves += change.T @ (smooth[:, None] * change)
+        hessian = np.zeros((5 * n, 5 * n))
+        hessian[: 2 * n, : 2 * n] = moves
+        hessian[2 * n :, 2 * n :] = share * np.diag(np.tile(problem.quadratic_penalty, n))
+        effort_slope = effort * inputs.ravel() + change.T @ (smooth * (inputs - before).ravel())
+        gradient = np.concatenate(
+            [
+                effort_slope - outputs.T @ (prices * error),
+                share * np.tile(problem.linear_penalty, n),
+            ]
+        )
+
         rates = np.einsum("ij,ijk->ik", along.rate_x, influence[:-1])
         for i in range(n):
             rates[i, 2 * i : 2 * i + 2] += along.rate_u[i]

@@ -6,10 +6,11 @@ from numpy.typing import NDArray
 
 from agents.nmpc.problem import NmpcProblem, Status
 from agents.nmpc.rti_solver import RtiSolver
+from agents.weights import TrackingWeights
 from experiments.verify.oracles import CasadiDerivatives, PiqpOracle
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES, VehicleParameters
 from tests.helpers.condensed_qp import CondensedQp, excess, within
-from tests.helpers.nmpc_situations import MIRROR_INPUT, WEIGHTS, Situation, arc, hard
+from tests.helpers.nmpc_situations import MIRROR_INPUT, Situation, arc, hard
 
 Array = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ each_vehicle = pytest.mark.parametrize("car", VEHICLES.values(), ids=list(VEHICL
 def problem_of(car: VehicleParameters, n: int) -> NmpcProblem:
     # Unequal periods and penalties: no entry can stand in for another.
     return NmpcProblem(
-        car, horizon=n, period=0.05, first_period=0.03,
+        car, horizon=n, stages=tuple(0.05 + 0.02 * np.sin(np.arange(n))), first_period=0.03,
         linear_penalty=(20.0, 15.0, 25.0), quadratic_penalty=(100.0, 80.0, 120.0),
     )  # fmt: skip
 
@@ -114,8 +115,10 @@ def test_without_limits_it_is_the_linear_quadratic_regulators(
         max_jerk=1e6, max_steering_angle=1e3, max_steering_rate=1e6,
         max_lateral_velocity_ratio=1e3, speed_range=(1e-3, 1e4), implausible=True,
     )  # fmt: skip
-    problem, rng = NmpcProblem(free, horizon=n, first_period=0.03), np.random.default_rng(2)
-    narrow = NmpcProblem(M2_MINIBUS, horizon=n, first_period=0.03)
+    stages = tuple(np.linspace(0.03, 0.07, n))
+    problem = NmpcProblem(free, horizon=n, stages=stages, first_period=0.03)
+    narrow = NmpcProblem(M2_MINIBUS, horizon=n, stages=stages, first_period=0.03)
+    rng = np.random.default_rng(2)
     solver, exact = RtiSolver(problem, damping=damping), CasadiDerivatives(problem)
     for _ in range(10):
         case = hard(rng, narrow)
@@ -130,29 +133,33 @@ def test_without_limits_it_is_the_linear_quadratic_regulators(
 
 
 def test_one_straight_period_by_hand() -> None:
-    """v' = a - mu g: the cost of the one acceleration is a parabola."""
+    """v' = a - mu g: the cost of the one acceleration is a parabola.
+
+    A stage of 0.1 s counts twice, and the weight on the jerk for 2 / 0.1^2.
+    """
     car = M2_MINIBUS.replace(max_jerk=1e3)
     period, v, drag = 0.1, 10.0, M2_MINIBUS.rolling_deceleration
     problem = NmpcProblem(car, horizon=1, period=period)
-    weights = np.array([1.0, 1.0, 1.0, 1.0, 7.0, 1.0, 30.0, 1.0, 0.2, 1.0])
+    weights = np.array([1.0, 1.0, 1.0, 1.0, 7.0, 1.0, 30.0, 1.0, 0.1, 1.0, 1e-3, 0.0])
     reference = np.array([[v, 0.0, 0.0, 0.0], [10.1, 0.0, 1.003, 0.0]])
     # v1 = v + T (a - drag), X1 = T v + T^2/2 (a - drag)
     by_v, by_x = period, 0.5 * period**2
     v0, x0 = v - period * drag, period * v - 0.5 * period**2 * drag
     pull = 7.0 * by_v * (10.1 - v0) + 30.0 * by_x * (1.003 - x0)
-    wanted = pull / (7.0 * by_v**2 + 30.0 * by_x**2 + 0.2)
+    pull += 0.2 * 0.3  # the acceleration in force
+    wanted = pull / (7.0 * by_v**2 + 30.0 * by_x**2 + 0.2 + 0.2)
     state = np.array([v, 0.0, 0.0, 0.0, 0.0, 0.0])
     for plan in (0.0, wanted, -1.0):
         status, found = RtiSolver(problem).solve_qp(
-            state, np.zeros(2), reference, weights, np.array([[plan, 0.0]])
+            state, np.array([0.3, 0.0]), reference, weights, np.array([[plan, 0.0]])
         )
         assert status is Status.SUCCESS
         np.testing.assert_allclose(found, [[wanted, 0.0]], atol=1e-9)
     # Damping pulls towards the plan.
     _, damped = RtiSolver(problem, damping=(0.3, 0.1)).solve_qp(
-        state, np.zeros(2), reference, weights, np.array([[-1.0, 0.0]])
+        state, np.array([0.3, 0.0]), reference, weights, np.array([[-1.0, 0.0]])
     )
-    curvature = 7.0 * by_v**2 + 30.0 * by_x**2 + 0.2
+    curvature = 7.0 * by_v**2 + 30.0 * by_x**2 + 0.4
     assert damped[0, 0] == pytest.approx((pull - 0.3) / (curvature + 0.3), abs=1e-9)
 
 
@@ -174,12 +181,12 @@ def test_mirrored_program_has_the_mirrored_optimum(car: VehicleParameters) -> No
 def test_first_period_bounds_the_first_change() -> None:
     """Far off the path with cheap steering, it turns as fast as it may, from the first step on."""
     for first_period in (0.02, 0.05, 0.08):
-        problem = NmpcProblem(M2_MINIBUS, horizon=10, first_period=first_period)
+        problem = NmpcProblem(M2_MINIBUS, horizon=10, period=0.05, first_period=first_period)
         state = np.array([8.0, 0.0, 0.0, 0.0, 0.0, 3.0])
         last = np.array([0.2, 0.0])
         reference = arc(0.0, np.full(11, 12.0), 0.05)
         _, found = RtiSolver(problem).solve_qp(
-            state, last, reference, WEIGHTS, np.tile(last, (10, 1))
+            state, last, reference, TrackingWeights().as_array(), np.tile(last, (10, 1))
         )
         first, second = found[0] - last, found[1] - found[0]
         rates = np.array([M2_MINIBUS.max_jerk, -M2_MINIBUS.max_steering_rate])

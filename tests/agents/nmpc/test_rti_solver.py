@@ -131,10 +131,13 @@ def test_plans_keep_the_hard_limits_and_are_priced_as_predicted(car: VehiclePara
         assert (slack >= -1e-9).all()
         broken = np.maximum(broken, slack.max(axis=0))
         error = case.reference - states[:, [VX, PSI, X, Y]]
-        q, s, r = case.weights[:4], case.weights[4:8], case.weights[8:]
-        cost = 0.5 * (np.sum(error[:-1] ** 2 * q) + s @ error[-1] ** 2 + np.sum(inputs**2 * r))
-        cost += np.sum(slack * problem.linear_penalty)
-        cost += 0.5 * np.sum(slack**2 * problem.quadratic_penalty)
+        q, s, r, r_rate = np.split(case.weights, (4, 8, 10))
+        share, spacing = problem.periods[:, None] / 0.05, problem.spacings[:, None]
+        rates = np.diff(np.vstack([case.last_input, inputs]), axis=0) / spacing
+        cost = 0.5 * (np.sum(share * error[:-1] ** 2 * q) + s @ error[-1] ** 2)
+        cost += 0.5 * (np.sum(share * inputs**2 * r) + np.sum(spacing / 0.05 * rates**2 * r_rate))
+        cost += np.sum(share * slack * problem.linear_penalty)
+        cost += 0.5 * np.sum(share * slack**2 * problem.quadratic_penalty)
         assert solution.cost == pytest.approx(cost, rel=1e-12)
         # The slack is what the predicted states need.
         vx, vy = states[1:, :2].T
@@ -250,7 +253,7 @@ def test_no_weight_on_anything_is_solved() -> None:
     """Any plan within the limits is optimal then; none may be NaN."""
     problem = NmpcProblem(M2_MINIBUS)
     (case,) = cases(1, problem)
-    solution, _ = RtiSolver(problem).solve(*case.parameters[:3], np.zeros(10))
+    solution, _ = RtiSolver(problem).solve(*case.parameters[:3], np.zeros(12))
     if solution.status is Status.SUCCESS:
         assert excess(problem, case.last_input, solved(solution)[0]) <= 1e-9
     else:
