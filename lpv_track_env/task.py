@@ -148,6 +148,7 @@ class Task:
                     tightest_turn(self.path.table, self.path.closed),
                     self.start_range,
                     *self.initial_error_range,
+                    car.centre_of_gravity_height,
                 ],
                 self.reward_weights.as_array(),
             ]

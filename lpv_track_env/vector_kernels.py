@@ -103,7 +103,7 @@ def integrate_lanes(b: Array, substeps: int) -> None:
                 b[PARAMETERS + j], b[PARAMETERS + LANES + j], b[PARAMETERS + 2 * LANES + j],
                 b[PARAMETERS + 3 * LANES + j], b[PARAMETERS + 4 * LANES + j],
                 b[PARAMETERS + 5 * LANES + j],
-                b[SUBSTEP + j], True,
+                0.0, 0.0, b[SUBSTEP + j], True, False,
             )  # fmt: skip
             c, s = rotate(b[COS + j], b[SIN + j], turn)
             b[j], b[LANES + j], b[3 * LANES + j] = vx, vy, r

@@ -72,6 +72,7 @@ def test_presets_are_the_packages(vehicle: str) -> None:
     car, given = VEHICLES[vehicle], setup_vehicle_parameters(VEHICLE_IDS[vehicle])
     assert (car.mass, car.yaw_inertia) == (given.m, given.I_z)
     assert (car.front_axle_distance, car.rear_axle_distance) == (given.a, given.b)
+    assert car.centre_of_gravity_height == given.h_cg
     assert (car.length, car.width) == (given.l, given.w)
     assert (-car.max_steering_angle, car.max_steering_angle) == (
         given.steering.min, given.steering.max,
