@@ -111,7 +111,9 @@ class Conditions:
     load that braking shifts between the axles: the model of `lpv_track_env.tyres`.
 
     A plant other than the bicycle (`lpv_track_env.plants`) has its own mass, inertia, stiffness,
-    rolling resistance, friction and wind: the fields for these have no effect.
+    rolling resistance and wind: the fields for these have no effect. Friction multiplies the grip
+    of `drift` and `multi-body`, 1.05 on their own road; on plants without such a limit
+    (`single-track`) it has no effect, and the environment warns.
 
     A computation that takes longer than a control period makes the controller miss the next
     deadline: its action is dropped, the command in force is held, and `deadline_misses` counts it.
