@@ -96,14 +96,17 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     ## Starting state
 
     On the path at its start, at the reference speed, steering straight. `initial_error_range` gives
-    uniformly drawn errors in lateral offset (m), heading (rad) and speed (m/s); `random_start`
-    draws the arc length, too. `reset(seed=...)` seeds `self.np_random` and takes one key from it;
-    an episode depends on this key and the episode's number (`lpv_track_env.episodes`). Environment
-    i of a `PathTrackingVectorEnv` reset with seed s therefore equals this one reset with s + i.
+    uniformly drawn errors in lateral offset (m), heading (rad) and speed (m/s), at the least
+    standstill unless the vehicle reverses; `random_start` draws the arc length, too.
+    `reset(seed=...)` seeds `self.np_random` and takes one key from it; an episode depends on this
+    key and the episode's number (`lpv_track_env.episodes`). Environment i of a
+    `PathTrackingVectorEnv` reset with seed s therefore equals this one reset with s + i.
 
     `reset(options=...)` takes `trajectory`, `vehicle` (both as in the arguments), `arc_length` (m),
-    `lateral_error` (m), `heading_error` (rad), `speed_error` (m/s). They hold for one episode; the
-    next reset returns to the constructor's arguments.
+    `lateral_error` (m), `heading_error` (rad), and `speed_error` or `speed` (m/s). They hold for
+    one episode; the next reset returns to the constructor's arguments. A speed below standstill
+    raises a ValueError unless the vehicle reverses, that is, its `speed_range` begins below 0. Such
+    a vehicle alone drives backwards: the brakes of every other one hold it at standstill.
 
     ## Info
 
@@ -352,6 +355,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         options, seed = checked_options(options, RESET_OPTIONS), checked_seed(seed)
         task = self.episode_task(options)
         given = given_start(options, task.path.length)
+        task.check_start(given)
         plant = self._plant_of(task)
         # All is checked: from here on the last episode is gone.
         super().reset(seed=seed)

@@ -87,7 +87,8 @@ class VehicleParameters:
     longitudinal_acceleration_range
         Bounds of dvx/dt, m/s^2; by default -4 and 2 (the paper's text says 2, its table implies 1).
     speed_range
-        Bounds of vx for controllers, m/s.
+        Bounds of vx for controllers, m/s. A vehicle whose lower bound is not negative does not
+        reverse: its brakes hold it at standstill.
     max_lateral_velocity_ratio
         Bound of |vy| / vx. In a steady turn at low speed it limits curvature to about ratio / lr.
     length, width
@@ -151,6 +152,16 @@ class VehicleParameters:
     def wheelbase(self) -> float:
         """Distance lf + lr between the axles, m."""
         return self.front_axle_distance + self.rear_axle_distance
+
+    @property
+    def lowest_speed(self) -> float:
+        """Speed at which brakes hold the vehicle, m/s: 0, or -inf for one that reverses."""
+        return 0.0 if self.speed_range[0] >= 0.0 else -math.inf
+
+    @property
+    def lowest_start(self) -> float:
+        """Lowest speed of a start, m/s: standstill, or that of a vehicle that reverses."""
+        return min(self.speed_range[0], 0.0)
 
     @property
     def rolling_deceleration(self) -> float:

@@ -185,11 +185,13 @@ def drive_vehicle(
             vx, vy, psi, r, x, y = integrate_sliding(
                 vx, vy, psi, r, x, y, a, delta,
                 m[q], m[q + 1], m[q + 2], m[q + 3], m[q + 4], m[q + 5], m[q + 6], tyre, h, 1,
+                p[k.LOWEST_SPEED],
             )  # fmt: skip
         else:
             vx, vy, psi, r, x, y = integrate(
                 vx, vy, psi, r, x, y, a, delta,
                 m[q], m[q + 1], m[q + 2], m[q + 3], m[q + 4], m[q + 5], m[q + 6], h, 1,
+                p[k.LOWEST_SPEED],
             )  # fmt: skip
         vy += 0.5 * h * push
         r += 0.5 * h * spin

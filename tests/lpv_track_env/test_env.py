@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import trajectories
-from lpv_track_env import HIGHWAY_TRACK, PATH_TRACKING, WEIGHT_TUNING, kernels
+from lpv_track_env import HIGHWAY_TRACK, PATH_TRACKING, WEIGHT_TUNING, kernels, vehicle
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.highway.env import HighwayTrackEnv
 from lpv_track_env.reward import TERMS, RewardWeights
@@ -484,7 +484,7 @@ def test_as_made_it_is_bare_and_keeps_the_order_of_calls_itself() -> None:
         ({"lateral_error": -20.0}, "left_corridor"),
         ({"heading_error": math.pi}, "wrong_heading"),
         ({"heading_error": -2.0}, "wrong_heading"),
-        ({"lateral_error": 20.0, "heading_error": math.pi, "speed_error": -20.0}, "left_corridor"),
+        ({"lateral_error": 20.0, "heading_error": math.pi, "speed": 0.0}, "left_corridor"),
         ({"lateral_error": 1e9}, "left_corridor"),
     ],
 )
@@ -506,7 +506,8 @@ def test_hopeless_start_ends_with_a_reason(
 @pytest.mark.parametrize("speed", [0.0, -5.0, 40.0, 1e-9])
 @pytest.mark.parametrize("name", VEHICLES)
 def test_any_speed_stays_finite(name: str, speed: float) -> None:
-    env = make(trajectory="circle", vehicle=name, max_lateral_error=1e6)
+    car = vehicle.load(name).replace(speed_range=(-5.0, 30.0))
+    env = make(trajectory="circle", vehicle=car, max_lateral_error=1e6)
     reference = float(env.path.speed[0])
     env.reset(seed=0, options={"speed_error": speed - reference})
     assert env.state[0] == pytest.approx(speed, abs=1e-12)
@@ -687,6 +688,13 @@ BAD_RESETS: dict[str, tuple[dict[str, Any], str]] = {
     "trajectory": ({"trajectory": "T7"}, "unknown trajectory 'T7'"),
     "vehicle": ({"vehicle": "tank"}, "unknown vehicle 'tank'"),
     "late": ({"trajectory": "T2", "lateral_error": math.nan}, "lateral_error must be in"),
+    "reverse": (
+        {"speed_error": -99.0},
+        r"speed_error -99 m/s: .* start at -96 m/s, .*'m2-minibus' drives at 0 .* at least -3$",
+    ),
+    "reverse-there": ({"speed_error": -9.9, "arc_length": 200.0}, r"start at -6.9 m/s"),
+    "reverse-speed": ({"speed": -0.5}, "speed -0.5 m/s: .* at least 0$"),
+    "speed-twice": ({"speed": 1.0, "speed_error": 1.0}, "give one of them"),
 }
 
 
@@ -754,6 +762,10 @@ BAD_ARGUMENTS: dict[str, tuple[dict[str, Any], str]] = {
     "errors": ({"initial_error_range": (1.0, 2.0)}, "initial_error_range must be 3 numbers"),
     "errors-negative": ({"initial_error_range": (1.0, -2.0, 0.0)}, "initial_error_range.+ must be"),
     "errors-nan": ({"initial_error_range": (math.nan, 0.0, 0.0)}, "initial_error_range.+ must be"),
+    "errors-reverse": (
+        {"initial_error_range": (0.0, 0.0, 99.0)},
+        "an error of 99 m/s is more than any speed of path 'straight' .* at most 10 m",
+    ),
     "errors-inf": ({"initial_error_range": (math.inf, 0.0, 0.0)}, "initial_error_range.+ must be"),
 }  # fmt: skip
 
