@@ -9,9 +9,10 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from trajectories import speed
 from trajectories.arguments import shown
 
-GRAVITY = 9.81  # m/s^2
+GRAVITY = speed.GRAVITY
 
 
 class Range(NamedTuple):
