@@ -21,6 +21,8 @@ RAW_PREVIEW = {"preview_steps": 30, "preview_period": 0.1}
 LEAST_SEEDS = 10
 HELD_OUT = tuple(f"random-{'fast-' * (seed % 2)}{seed}" for seed in range(20))
 """Random paths that `lpv-track train` uses neither for training nor for validation."""
+LIMIT_PATHS = tuple(f"random-limit-{seed}" for seed in range(100))
+"""Random paths at the limit that `lpv-track train` and `tune` do not take."""
 BESIDE = {"initial_error_range": [0.3, 0.1, 0.5]}
 """Start beside the path; in simulation, a seed changes nothing else."""
 LEARNED = ("ppo", "sac", "bc")
@@ -30,18 +32,18 @@ DEMONSTRATION = "lpv-mpc-frozen"
 
 _CAR = {"vehicles": ("bmw-320i",)}
 _TRUTH = {"name": "realtime", "estimator": "truth"}
-_AT_055_G = {**_CAR, "trajectories": [f"random-limit-{seed}" for seed in range(1, 92, 10)]}
+_AT_055_G = {**_CAR, "trajectories": LIMIT_PATHS[1::10]}
 _LANE_CHANGE = {**_CAR, "trajectories": ("double-lane-change",), "speed_modes": ("fixed",)}
 LIMITS: dict[str, list[dict[str, Any]]] = {
     "0.50 to 0.95 g, drift plant": [
         {
-            **_CAR, "trajectories": [f"random-limit-{seed}" for seed in range(10)],
+            **_CAR, "trajectories": LIMIT_PATHS[:10],
             "env_settings": {"plant": "drift"},
         }
     ],
     "95 % of grip, brush tyres": [
         {
-            **_CAR, "trajectories": [f"random-limit-{seed}" for seed in range(5, 96, 10)],
+            **_CAR, "trajectories": LIMIT_PATHS[5::10],
             "conditions": {"name": "ideal", "friction": 0.79},
         }
     ],
