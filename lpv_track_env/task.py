@@ -19,6 +19,7 @@ from lpv_track_env.validation import LARGEST_ERROR
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 from trajectories.arguments import Number, flag, instance_of, numbers, shown
+from trajectories.importers import imported
 from trajectories.naming import choose
 from trajectories.projection import tightest_turn
 from trajectories.speed import constant_speed
@@ -67,7 +68,29 @@ def reference(
         warnings.warn(message, UserWarning, stacklevel=4)
         noted = [*path.metadata.get("warnings", []), message]
         path = path.with_speed(np.minimum(path.speed, fastest), warnings=noted)
+    if imported(path) and (bend := too_sharp_bend(path, parameters)):
+        warnings.warn(bend, UserWarning, stacklevel=4)
     return path
+
+
+def too_sharp_bend(path: ReferencePath, car: VehicleParameters) -> str:
+    """Describe the bend that a vehicle can follow least, with the limit that binds; "" if none."""
+    curvature = np.abs(path.curvature)
+    by_steering, by_sideslip = car.sharpest_turns(path.speed)
+    largest = np.minimum(by_steering, by_sideslip)
+    k = int(np.argmax(curvature / largest))
+    if curvature[k] <= largest[k]:
+        return ""
+    limit = (
+        f"its steering angle of {car.max_steering_angle:.3g} rad"
+        if by_steering[k] < by_sideslip[k]
+        else f"its limit |vy| <= {car.max_lateral_velocity_ratio:g} vx"
+    )
+    return (
+        f"path {shown(path.name)}: bend of {1.0 / curvature[k]:.1f} m radius at "
+        f"{path.arc_length[k]:.1f} m, {limit} lets vehicle {shown(car.name)} turn on "
+        f"{1.0 / largest[k]:.1f} m or more at {path.speed[k]:.3g} m/s"
+    )
 
 
 def action_space(vehicles: Sequence[VehicleParameters]) -> spaces.Space[NDArray[np.float32]]:

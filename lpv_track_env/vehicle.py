@@ -14,6 +14,8 @@ from trajectories.arguments import Number, instance_of, shortened, shown
 from trajectories.fileio import read_json
 from trajectories.naming import suggestion
 
+Array = NDArray[np.float64]
+
 PARAMETER_ORDER = (
     "mass",
     "yaw_inertia",
@@ -177,6 +179,25 @@ class VehicleParameters:
         caf, car = self.front_cornering_stiffness, self.rear_cornering_stiffness
         lf, lr = self.front_axle_distance, self.rear_axle_distance
         return self.mass * (lr * car - lf * caf) / (self.wheelbase * caf * car)
+
+    def sharpest_turns(self, speed: Array) -> tuple[Array, Array]:
+        """Return the largest curvatures of steady turns at speeds vx (n,), 1/m, shape (n,).
+
+        The first is limited by `max_steering_angle`, the second by `max_lateral_velocity_ratio`: in
+        a steady turn vy = b r with b = lr - m vx^2 lf/(L Car), and the steering angle is
+        (L + K vx^2) r/vx with the understeer gradient K; the curvature is r/sqrt(vx^2 + vy^2).
+        """
+        squared = speed * speed
+        lever = self.rear_axle_distance - squared * (
+            self.mass * self.front_axle_distance / self.wheelbase / self.rear_cornering_stiffness
+        )
+        steered = np.maximum(self.wheelbase + self.understeer_gradient * squared, 1e-9)
+        by_steering = self.max_steering_angle / steered
+        by_sideslip = self.max_lateral_velocity_ratio / np.maximum(np.abs(lever), 1e-9)
+        return (
+            by_steering / np.hypot(1.0, by_steering * lever),
+            by_sideslip / np.hypot(1.0, by_sideslip * lever),
+        )
 
     def as_array(self) -> NDArray[np.float64]:
         """Physical parameters in `PARAMETER_ORDER`, shape (7,), for compiled kernels."""

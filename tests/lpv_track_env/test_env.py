@@ -4,6 +4,7 @@ import copy
 import inspect
 import math
 import pickle
+import re
 import subprocess
 import sys
 import warnings
@@ -797,6 +798,45 @@ def test_speed_beyond_the_vehicles_is_lowered_with_a_warning() -> None:
         env = make(trajectory=path)
     assert env.path.speed.max() == 30.0
     assert "speed lowered" in env.path.metadata["warnings"][-1]
+
+
+def right_angle(tmp_path: Path) -> Path:
+    """Two straights of 50 m that meet at a right angle, every 5 m."""
+    along = np.arange(0.0, 51.0, 5.0)
+    points = [*((s, 0.0) for s in along), *((50.0, s) for s in along[1:])]
+    file = tmp_path / "corner.csv"
+    file.write_text("x,y\n" + "".join(f"{x},{y}\n" for x, y in points))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("changes", "limit"),
+    [
+        ({}, r"its limit \|vy\| <= 0.17 vx lets vehicle 'm2-minibus' turn on 10\.\d m or more"),
+        ({"max_lateral_velocity_ratio": 0.5}, r"its steering angle of 0.524 rad .* on 6\.\d m"),
+        ({"max_steering_angle": 0.2}, r"its steering angle of 0.2 rad .* on 16\.\d m"),
+    ],
+)
+def test_a_bend_too_sharp_is_told_with_the_limit_that_binds(
+    tmp_path: Path, changes: dict[str, float], limit: str
+) -> None:
+    file = right_angle(tmp_path)
+    car = M2_MINIBUS.replace(**changes)
+    with pytest.warns(UserWarning, match="bend of") as caught:
+        make(trajectory=str(file), vehicle=car)
+    texts = [str(one.message) for one in caught]
+    assert len(texts) == 2
+    assert "bend of 1.4 m radius at 50.2 m: more smoothing may widen it" in texts[0]
+    assert re.search(rf"'corner': bend of 1.4 m radius at 50.2 m, {limit}", texts[1])
+
+
+def test_a_bend_that_the_vehicle_takes_is_not_told(tmp_path: Path) -> None:
+    nimble = M2_MINIBUS.replace(max_lateral_velocity_ratio=1.9, max_steering_angle=1.5,
+                                rear_axle_distance=0.4, front_axle_distance=0.4,
+                                implausible=True)  # fmt: skip
+    with pytest.warns(UserWarning, match="more smoothing") as caught:
+        make(trajectory=str(right_angle(tmp_path)), vehicle=nimble)
+    assert len(caught) == 1
 
 
 def test_frames_are_as_many_as_control_periods() -> None:
