@@ -35,13 +35,15 @@ from trajectories.compilation import compiled, compiled_internal
 
 Array = NDArray[Any]
 
-# Settings of the prediction, (SETTINGS,) float64: times in s, then the model's 7 parameters.
+# Settings of the prediction, (SETTINGS,) float64: times in s, then the model's 7 parameters and its
+# lowest speed (m/s).
 (
     DRIVE_DELAY, DRIVE_LAG, STEERING_DELAY, STEERING_LAG, HORIZON, DRIVE_HORIZON, PERIOD,
     PREVIEW_PERIOD, SUBSTEP,
 ) = range(9)  # fmt: skip
 MODEL = 9
-SETTINGS = MODEL + 7
+LOWEST_SPEED = MODEL + 7
+SETTINGS = LOWEST_SPEED + 1
 
 FOOT = 3
 """Pose of the new foot point in the frame of the old one: x, y, heading."""
@@ -84,6 +86,7 @@ def drive_on(
         vx, vy, psi, r, x, y = integrate(
             vx, vy, psi, r, x, y, mean_a, mean_delta,
             p[m], p[m + 1], p[m + 2], p[m + 3], p[m + 4], p[m + 5], p[m + 6], h, 1,
+            p[LOWEST_SPEED],
         )  # fmt: skip
     return vx, vy, psi, r, x, y, a, delta
 
@@ -299,6 +302,7 @@ class NearFuture:
                 task.layout.preview_period,
                 longest_substep(vehicle),
                 *vehicle.as_array(),
+                vehicle.lowest_speed,
             ]
         )
         self.kept = math.ceil(max(drive, steering) / task.control_period) + 1

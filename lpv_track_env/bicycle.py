@@ -20,13 +20,17 @@ From 1 m/s upwards (the paper's domain) the field is exactly this. Below 1 m/s a
 reverse, where tyres damp lateral motion as they do forwards. With q(vx) = `inverse_speed` and the
 signed direction s = vx q (exactly 1 from 1 m/s upwards), the slip angles are
 delta s - (vy + lf r) q and -(vy - lr r) q, and rolling resistance decelerates by mu g s.
+
+`tyres` limits the forces Fyf, Fyr and the acceleration a by friction.
 """
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lpv_track_env.tyres import scheduled
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.compilation import compiled, compiled_internal
 
@@ -122,14 +126,17 @@ def jacobian(
     caf: Any,
     car: Any,
     rolling_deceleration: Any,
+    front_secant: Any,
 ) -> tuple[Any, Any, Any, Any, Any, Any, Any, Any, Any, Any, Any, Any]:
     """Partial derivatives of `field`'s (vx', vy', r') with respect to (vx, vy, r, delta).
 
-    The 12 values come row by row: those of vx', of vy', of r'. `slope` is dq/dvx. The remaining
-    derivatives need no function: dvx'/da = 1, and those of (X', Y') rotate with psi.
+    The 12 values come row by row: those of vx', of vy', of r'. `slope` is dq/dvx. `caf` and `car`
+    are the slopes of the axles' forces over slip, `front_secant` is the front axle's force by slip;
+    with linear tyres that is `caf` as well. The remaining derivatives need no function: with linear
+    tyres dvx'/da = 1, and those of (X', Y') rotate with psi.
     """
     direction, direction_slope = vx * q, q + vx * slope
-    front = caf * (delta * direction - (vy + lf * r) * q)
+    front = front_secant * (delta * direction - (vy + lf * r) * q)
     front_vx = caf * (delta * direction_slope - (vy + lf * r) * slope)
     front_vy, front_r, front_delta = -caf * q, -caf * lf * q, caf * direction
     rear_vx, rear_vy, rear_r = car * (lr * r - vy) * slope, -car * q, car * lr * q
@@ -164,6 +171,7 @@ def derivative(
     state: NDArray[np.float64] | Any,
     action: NDArray[np.float64] | Any,
     parameters: VehicleParameters,
+    friction: float = math.inf,
 ) -> NDArray[np.float64]:
     """Compute the vector field x' = f(x, u) on NumPy arrays.
 
@@ -175,6 +183,8 @@ def derivative(
         [a, delta], shape (2,) or (2, n); m/s^2, rad (counter-clockwise positive).
     parameters
         Parameters of the vehicle.
+    friction
+        Coefficient of friction of its tyres (`tyres`).
 
     Returns
     -------
@@ -194,22 +204,30 @@ def derivative(
         )
     vx, vy, psi, r, _, _ = x
     a, delta = u
+    q = inverse_speed(vx)
+    share, numbers = scheduled(
+        (vx, vy, r), (a, delta), q, parameters, friction, np.minimum, np.maximum
+    )
     rates = field(
-        vx, vy, r, np.cos(psi), np.sin(psi), a, delta, np.cos(delta), np.sin(delta),
-        inverse_speed(vx), *parameters.as_array(),
+        vx, vy, r, np.cos(psi), np.sin(psi), a * share, delta, np.cos(delta), np.sin(delta), q,
+        *numbers,
     )  # fmt: skip
     return np.array(np.broadcast_arrays(*rates))
 
 
-def casadi_derivative(state: Any, action: Any, parameters: VehicleParameters) -> Any:
+def casadi_derivative(
+    state: Any, action: Any, parameters: VehicleParameters, friction: float = math.inf
+) -> Any:
     """Compute the vector field (6, 1) on CasADi symbols: state (6, 1), action (2, 1)."""
     import casadi as ca
 
     vx, vy, psi, r, _, _ = ca.vertsplit(state)
     a, delta = ca.vertsplit(action)
+    q = casadi_inverse_speed(vx)
+    share, numbers = scheduled((vx, vy, r), (a, delta), q, parameters, friction, ca.fmin, ca.fmax)
     rates = field(
-        vx, vy, r, ca.cos(psi), ca.sin(psi), a, delta, ca.cos(delta), ca.sin(delta),
-        casadi_inverse_speed(vx), *parameters.as_array(),
+        vx, vy, r, ca.cos(psi), ca.sin(psi), a * share, delta, ca.cos(delta), ca.sin(delta), q,
+        *numbers,
     )  # fmt: skip
     return ca.vertcat(*rates)
 

@@ -1,5 +1,7 @@
 """`lpv_track_env/PathTracking-v0`: drive a reference path with acceleration and steering."""
 
+import math
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +16,7 @@ from lpv_track_env import episodes, kernels, plants
 from lpv_track_env.conditions import Actuation, Conditions
 from lpv_track_env.conditions import episode as conditions_episode
 from lpv_track_env.conditions import load as load_conditions
-from lpv_track_env.conditions.layout import ConditionedVehicle, info_of
+from lpv_track_env.conditions.layout import FRICTION, ConditionedVehicle, info_of
 from lpv_track_env.draws import random_key
 from lpv_track_env.episodes import single_info
 from lpv_track_env.observation import PREVIEW_PERIOD, PREVIEW_STEPS, ObservationLayout
@@ -32,6 +34,7 @@ from lpv_track_env.validation import (
 from lpv_track_env.vehicle import VehicleParameters
 from lpv_track_env.vehicle import load as load_vehicle
 from trajectories import ReferencePath
+from trajectories.arguments import shown
 from trajectories.compilation import entry_point
 from trajectories.naming import choose
 
@@ -93,14 +96,17 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     ## Starting state
 
     On the path at its start, at the reference speed, steering straight. `initial_error_range` gives
-    uniformly drawn errors in lateral offset (m), heading (rad) and speed (m/s); `random_start`
-    draws the arc length, too. `reset(seed=...)` seeds `self.np_random` and takes one key from it;
-    an episode depends on this key and the episode's number (`lpv_track_env.episodes`). Environment
-    i of a `PathTrackingVectorEnv` reset with seed s therefore equals this one reset with s + i.
+    uniformly drawn errors in lateral offset (m), heading (rad) and speed (m/s), at the least
+    standstill unless the vehicle reverses; `random_start` draws the arc length, too.
+    `reset(seed=...)` seeds `self.np_random` and takes one key from it; an episode depends on this
+    key and the episode's number (`lpv_track_env.episodes`). Environment i of a
+    `PathTrackingVectorEnv` reset with seed s therefore equals this one reset with s + i.
 
     `reset(options=...)` takes `trajectory`, `vehicle` (both as in the arguments), `arc_length` (m),
-    `lateral_error` (m), `heading_error` (rad), `speed_error` (m/s). They hold for one episode; the
-    next reset returns to the constructor's arguments.
+    `lateral_error` (m), `heading_error` (rad), and `speed_error` or `speed` (m/s). They hold for
+    one episode; the next reset returns to the constructor's arguments. A speed below standstill
+    raises a ValueError unless the vehicle reverses, that is, its `speed_range` begins below 0. Such
+    a vehicle alone drives backwards: the brakes of every other one hold it at standstill.
 
     ## Info
 
@@ -210,6 +216,13 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._renderer: Renderer | None = None
         self._open_views()
         self._use(self.base_task, self._plant_of(self.base_task))
+        if self._plant is not None and self._nominal_friction < self.friction == math.inf:
+            warnings.warn(
+                f"conditions: friction has no effect on plant {shown(plant)}, whose tyres have no "
+                "such limit",
+                UserWarning,
+                stacklevel=3,
+            )
 
     def _open_views(self) -> None:
         """Make views of the episode's array once, since making one takes as long as a copy."""
@@ -282,6 +295,17 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return Actuation() if self.conditions is None else self.conditions.actuation
 
     @property
+    def _nominal_friction(self) -> float:
+        return math.inf if self.conditions is None else self.conditions.ends("friction")[0]
+
+    @property
+    def friction(self) -> float:
+        """Nominal friction of tyres and road: the lower end of its range, inf without a limit."""
+        if self._plant is None:
+            return self._nominal_friction
+        return self._plant.nominal_friction(self._nominal_friction)
+
+    @property
     def actuators(self) -> tuple[float, float]:
         """Acceleration (m/s^2) and steering angle (rad) in force at the actuators."""
         return float(self._record[kernels.ACCELERATION]), float(self._record[kernels.STEERING])
@@ -329,6 +353,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         options, seed = checked_options(options, RESET_OPTIONS), checked_seed(seed)
         task = self.episode_task(options)
         given = given_start(options, task.path.length)
+        task.check_start(given)
         plant = self._plant_of(task)
         # All is checked: from here on the last episode is gone.
         super().reset(seed=seed)
@@ -345,7 +370,9 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
                 self._conditioned.vehicle, self._record, self._conditioned.spec, self._constants,
                 self._table, self._observation, self._draws, given,
             )  # fmt: skip
-        if plant is not None:
+        if plant is not None and self._conditioned is not None:
+            plant.begin(self._record, float(self._conditioned.vehicle[FRICTION]))
+        elif plant is not None:
             plant.begin(self._record)
         self._running = True
         self._begin_drawing()

@@ -23,7 +23,7 @@ Infos = dict[str, Any]
 TRAJECTORY_DRAW, VEHICLE_DRAW, START_DRAW, LATERAL_DRAW, HEADING_DRAW, SPEED_DRAW = range(6)
 """Number of each draw within an episode."""
 
-GIVEN = ("arc_length", "lateral_error", "heading_error", "speed_error")
+GIVEN = ("arc_length", "lateral_error", "heading_error", "speed_error", "speed")
 """Starting values that reset options may give, in the order of `given` in `begin`."""
 
 ROLLING_DECELERATION = 6
@@ -45,7 +45,8 @@ def begin(
 ) -> None:  # fmt: skip
     """Begin an episode: draw its start, set the state, write record and observation.
 
-    `given`, (4,) as `GIVEN` lists them in m, m, rad, m/s, replaces what would be drawn; NaN: drawn.
+    `given`, (5,) as `GIVEN` lists them in m, m, rad, m/s, m/s, replaces what would be drawn; NaN:
+    drawn. A vehicle that does not reverse starts at standstill rather than below it.
     """
     p = constants
     s = given[0]
@@ -58,7 +59,10 @@ def begin(
     heading = heading_at(table, length, closed, s)
     x, y = position_at(table, length, closed, s)
     record[:] = 0.0
-    record[VX] = speed_at(table, length, closed, s) + speed_error
+    speed = given[4]
+    if math.isnan(speed):
+        speed = speed_at(table, length, closed, s) + speed_error
+    record[VX] = max(speed, p[kernels.LOWEST_SPEED])
     record[PSI] = heading + heading_error
     record[X] = x - lateral_error * math.sin(heading)
     record[Y] = y + lateral_error * math.cos(heading)

@@ -37,8 +37,10 @@ MAX_STEERING, STEERING_STEP, LOWEST_ACCELERATION, HIGHEST_ACCELERATION, ACCELERA
 PERIOD, SUBSTEPS, PREVIEW_PERIOD, CORRIDOR, MAX_STEPS, LENGTH, CLOSED, TIGHTEST = (
     12, 13, 14, 15, 16, 17, 18, 19,
 )  # fmt: skip
-START_RANGE, LATERAL_RANGE, HEADING_RANGE, SPEED_RANGE, WEIGHTS = 20, 21, 22, 23, 24
-CONSTANTS_SIZE = 35
+START_RANGE, LATERAL_RANGE, HEADING_RANGE, SPEED_RANGE, HEIGHT, LOWEST_SPEED, WEIGHTS = (
+    20, 21, 22, 23, 24, 25, 26,
+)  # fmt: skip
+CONSTANTS_SIZE = 37
 
 # A single environment, float64: its command [a, delta], then
 RECORD = 2
@@ -237,7 +239,7 @@ def drive(
     substeps = int(p[SUBSTEPS])
     vx, vy, psi, r, x, y = integrate(
         record[VX], record[VY], record[PSI], record[YAW_RATE], record[X], record[Y], a, delta,
-        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[PERIOD] / substeps, substeps,
+        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[PERIOD] / substeps, substeps, p[LOWEST_SPEED],
     )  # fmt: skip
     return finish(record, constants, table, observation, vx, vy, psi, r, x, y, a, delta, bits)
 

@@ -9,9 +9,10 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from trajectories import speed
 from trajectories.arguments import shown
 
-GRAVITY = 9.81  # m/s^2
+GRAVITY = speed.GRAVITY
 
 
 class Range(NamedTuple):
@@ -29,6 +30,7 @@ PLAUSIBLE: Mapping[str, Range] = {
     "mass": Range(0.01, 1e5, "kg"),
     "front_axle_distance": Range(0.01, 15.0, "m", LENGTHS),
     "rear_axle_distance": Range(0.01, 15.0, "m", LENGTHS),
+    "centre_of_gravity_height": Range(0.005, 4.0, "m", LENGTHS),
     "rolling_resistance": Range(0.0, 0.5, "", (("%", 1e-2),)),
     "max_steering_angle": Range(0.01, 0.5 * math.pi, "rad", (("deg", DEGREE),)),
     "max_steering_rate": Range(0.01, 15.0, "rad/s", (("deg/s", DEGREE),)),

@@ -19,6 +19,7 @@ from lpv_track_env.validation import LARGEST_ERROR
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 from trajectories.arguments import Number, flag, instance_of, numbers, shown
+from trajectories.importers import imported
 from trajectories.naming import choose
 from trajectories.projection import tightest_turn
 from trajectories.speed import constant_speed
@@ -36,6 +37,8 @@ TIME_LIMIT = Number(0.0, 1e6, "s", above=True)
 """Rule of a time limit; at its end, 11 days, a vehicle that stands still would be forgotten."""
 ERROR_RANGE = Number(0.0, LARGEST_ERROR)
 """Rule of the half of a range of initial errors: m, rad, m/s."""
+SPEED_ROUNDING = 1e-6
+"""m/s; a start slower than the lowest speed by no more than this starts at that speed."""
 
 
 def checked_period(value: float) -> float:
@@ -65,7 +68,29 @@ def reference(
         warnings.warn(message, UserWarning, stacklevel=4)
         noted = [*path.metadata.get("warnings", []), message]
         path = path.with_speed(np.minimum(path.speed, fastest), warnings=noted)
+    if imported(path) and (bend := too_sharp_bend(path, parameters)):
+        warnings.warn(bend, UserWarning, stacklevel=4)
     return path
+
+
+def too_sharp_bend(path: ReferencePath, car: VehicleParameters) -> str:
+    """Describe the bend that a vehicle can follow least, with the limit that binds; "" if none."""
+    curvature = np.abs(path.curvature)
+    by_steering, by_sideslip = car.sharpest_turns(path.speed)
+    largest = np.minimum(by_steering, by_sideslip)
+    k = int(np.argmax(curvature / largest))
+    if curvature[k] <= largest[k]:
+        return ""
+    limit = (
+        f"its steering angle of {car.max_steering_angle:.3g} rad"
+        if by_steering[k] < by_sideslip[k]
+        else f"its limit |vy| <= {car.max_lateral_velocity_ratio:g} vx"
+    )
+    return (
+        f"path {shown(path.name)}: bend of {1.0 / curvature[k]:.1f} m radius at "
+        f"{path.arc_length[k]:.1f} m, {limit} lets vehicle {shown(car.name)} turn on "
+        f"{1.0 / largest[k]:.1f} m or more at {path.speed[k]:.3g} m/s"
+    )
 
 
 def action_space(vehicles: Sequence[VehicleParameters]) -> spaces.Space[NDArray[np.float32]]:
@@ -107,6 +132,41 @@ class Task:
             checked["time_limit"] = TIME_LIMIT.of("time_limit", self.time_limit)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+        car, half, fastest = self.vehicle, self.initial_error_range[2], self.path.speed.max()
+        if half > fastest - car.lowest_start:
+            raise ValueError(
+                f"initial_error_range: an error of {half:g} m/s is more than any speed of path "
+                f"{shown(self.path.name)} (up to {fastest:g} m/s) allows for vehicle "
+                f"{shown(car.name)}: at most {fastest - car.lowest_start:g} m/s"
+            )
+
+    def check_start(self, given: Array) -> None:
+        """Check the speed of a start that reset options give; `given` as in `episodes.begin`.
+
+        Raises
+        ------
+        ValueError
+            If it is below the vehicle's lowest speed, at a drawn arc length even where the path is
+            fastest.
+        """
+        start, _, _, speed_error, speed = given.tolist()
+        if math.isnan(speed):
+            if not speed_error < 0.0:
+                return
+            if math.isnan(start) and self.random_start:
+                reference = float(self.path.speed.max())
+            else:
+                reference = float(self.path.sample(0.0 if math.isnan(start) else start).speed)
+            speed, option = reference + speed_error, f"speed_error {speed_error:g} m/s"
+        else:
+            reference, option = 0.0, f"speed {speed:g} m/s"
+        lowest = self.vehicle.lowest_start
+        if speed < lowest - SPEED_ROUNDING:
+            raise ValueError(
+                f"reset option {option}: an episode cannot start at {speed:g} m/s, vehicle "
+                f"{shown(self.vehicle.name)} drives at {lowest:g} m/s or more: give at least "
+                f"{lowest - reference:g}"
+            )
 
     @property
     def substeps(self) -> int:
@@ -148,6 +208,8 @@ class Task:
                     tightest_turn(self.path.table, self.path.closed),
                     self.start_range,
                     *self.initial_error_range,
+                    car.centre_of_gravity_height,
+                    car.lowest_speed,
                 ],
                 self.reward_weights.as_array(),
             ]

@@ -270,13 +270,16 @@ def checked_threads(value: int) -> int:
 
 
 def given_start(options: Mapping[str, Any], length: float) -> NDArray[np.float64]:
-    """Return the start that reset options give, (4,) in the order of `GIVEN`; NaN is drawn.
+    """Return the start that reset options give, (5,) in the order of `GIVEN`; NaN is drawn.
 
     Raises
     ------
     ValueError
-        For a value that is not a finite number, or an arc length outside of the path.
+        For a value that is not a finite number, an arc length outside of the path, or both a speed
+        and an error of it.
     """
+    if "speed" in options and "speed_error" in options:
+        raise ValueError("reset options speed and speed_error: give one of them")
     start = np.full(len(GIVEN), math.nan)
     for k, key in enumerate(GIVEN):
         if key not in options:

@@ -269,6 +269,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
             tasks = self._tasks_of(paths, cars)
             drawn = (len(self.tasks), len(paths), len(cars))
         given = validation.given_start(options, min(task.path.length for task in tasks))
+        for task in tasks:
+            task.check_start(given)
         # All is checked: from here on the last episodes are gone.
         if isinstance(seed, int):
             super().reset(seed=seed)

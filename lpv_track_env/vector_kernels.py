@@ -81,8 +81,10 @@ LANES = 32
 COS, SIN, ACCELERATION, STEERING, COS_STEERING, SIN_STEERING, PARAMETERS = (
     6 * LANES, 7 * LANES, 8 * LANES, 9 * LANES, 10 * LANES, 11 * LANES, 12 * LANES,
 )  # fmt: skip
-SUBSTEP, CLIPPED, PUSH, SUBSTEPS = 18 * LANES, 19 * LANES, 20 * LANES, 21 * LANES
-SCRATCH_SIZE = 22 * LANES
+SUBSTEP, CLIPPED, PUSH, SUBSTEPS, LOWEST = (
+    18 * LANES, 19 * LANES, 20 * LANES, 21 * LANES, 22 * LANES,
+)  # fmt: skip
+SCRATCH_SIZE = 23 * LANES
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)
 """Modes of `gymnasium.vector.AutoresetMode`: when an environment that has ended is reset."""
@@ -103,7 +105,7 @@ def integrate_lanes(b: Array, substeps: int) -> None:
                 b[PARAMETERS + j], b[PARAMETERS + LANES + j], b[PARAMETERS + 2 * LANES + j],
                 b[PARAMETERS + 3 * LANES + j], b[PARAMETERS + 4 * LANES + j],
                 b[PARAMETERS + 5 * LANES + j],
-                b[SUBSTEP + j], True,
+                0.0, 0.0, b[SUBSTEP + j], b[LOWEST + j], True, False,
             )  # fmt: skip
             c, s = rotate(b[COS + j], b[SIN + j], turn)
             b[j], b[LANES + j], b[3 * LANES + j] = vx, vy, r
@@ -133,7 +135,7 @@ def load_lane(b: Array, j: int, record: Array, action: Array, p: Array) -> None:
     q = in_half_steps(0.5 * h, p[0], p[1], p[2], p[3], p[4], p[5], p[6])
     for row in range(len(q)):
         b[PARAMETERS + row * LANES + j] = q[row]
-    b[CLIPPED + j] = bits
+    b[CLIPPED + j], b[LOWEST + j] = bits, p[k.LOWEST_SPEED]
 
 
 @compiled_internal
@@ -144,6 +146,7 @@ def integrate_one(b: Array, j: int, record: Array, p: Array) -> None:
         record[VX], record[VY], record[PSI], record[YAW_RATE], record[X], record[Y],
         b[ACCELERATION + j], b[STEERING + j],
         p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[k.PERIOD] / substeps, substeps,
+        p[k.LOWEST_SPEED],
     )  # fmt: skip
     b[j], b[LANES + j], b[2 * LANES + j] = vx, vy, psi
     b[3 * LANES + j], b[4 * LANES + j], b[5 * LANES + j] = r, x, y

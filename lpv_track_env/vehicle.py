@@ -14,6 +14,8 @@ from trajectories.arguments import Number, instance_of, shortened, shown
 from trajectories.fileio import read_json
 from trajectories.naming import suggestion
 
+Array = NDArray[np.float64]
+
 PARAMETER_ORDER = (
     "mass",
     "yaw_inertia",
@@ -25,6 +27,10 @@ PARAMETER_ORDER = (
 )
 """Order of `VehicleParameters.as_array` and of the last arguments of `bicycle.field`."""
 
+HEIGHT_SHARE = 0.23
+"""Height of the centre of gravity by the wheelbase, where it is not given: that of CommonRoad's two
+cars (0.233 and 0.223); its van has 0.303."""
+
 
 def _finite(value: Any) -> bool:
     """Return whether a value is a number in double precision."""
@@ -33,6 +39,21 @@ def _finite(value: Any) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _wanted(name: str, value: Any) -> str | None:
+    """Return what a field must be, or None if its value is that."""
+    if name in {"name", "source"}:
+        return None if isinstance(value, str) and value.isprintable() else "a text line"
+    if name == "implausible":
+        return None if isinstance(value, bool) else "true or false"
+    if name.endswith("_range"):
+        ends = tuple(value) if isinstance(value, tuple | list) else ()
+        ordered = len(ends) == 2 and all(map(_finite, ends)) and ends[0] < ends[1]
+        return None if ordered else "two finite numbers, the lower first"
+    if name == "rolling_resistance":
+        return None if _finite(value) and value >= 0 else ">= 0"
+    return None if _finite(value) and value > 0 else "positive"
 
 
 @dataclass(frozen=True)
@@ -68,11 +89,16 @@ class VehicleParameters:
     longitudinal_acceleration_range
         Bounds of dvx/dt, m/s^2; by default -4 and 2 (the paper's text says 2, its table implies 1).
     speed_range
-        Bounds of vx for controllers, m/s.
+        Bounds of vx for controllers, m/s. A vehicle whose lower bound is not negative does not
+        reverse: its brakes hold it at standstill.
     max_lateral_velocity_ratio
         Bound of |vy| / vx. In a steady turn at low speed it limits curvature to about ratio / lr.
     length, width
         Size of the body, m, for drawing, and for gaps and collisions in traffic.
+    centre_of_gravity_height
+        Height h of the centre of gravity above the road, m, by which acceleration and braking shift
+        load between the axles where friction is limited (`tyres`); by default `HEIGHT_SHARE` of the
+        wheelbase.
     implausible
         Takes values outside of `plausibility.PLAUSIBLE` as they are; they suggest other units.
 
@@ -101,34 +127,26 @@ class VehicleParameters:
     max_lateral_velocity_ratio: float = 0.17
     length: float = 4.5
     width: float = 1.8
+    centre_of_gravity_height: float = None  # type: ignore[assignment]  # by the wheelbase
     implausible: bool = False
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            value, wanted = getattr(self, field.name), None
+            value = getattr(self, field.name)
             if field.name == "source" and isinstance(value, str):
                 value = " ".join(value.split())  # may be written on several lines
-                object.__setattr__(self, field.name, value)
-            if field.name in {"name", "source"}:
-                wanted = None if isinstance(value, str) and value.isprintable() else "a text line"
-            elif field.name == "implausible":
-                wanted = None if isinstance(value, bool) else "true or false"
-            elif field.name.endswith("_range"):
-                ends = tuple(value) if isinstance(value, tuple | list) else ()
-                if len(ends) != 2 or not all(map(_finite, ends)) or ends[0] >= ends[1]:
-                    wanted = "two finite numbers, the lower first"
-                else:
-                    object.__setattr__(self, field.name, (float(ends[0]), float(ends[1])))
-            elif field.name == "rolling_resistance":
-                wanted = None if _finite(value) and value >= 0 else ">= 0"
-            else:
-                wanted = None if _finite(value) and value > 0 else "positive"
+            elif field.name == "centre_of_gravity_height" and value is None:
+                value = HEIGHT_SHARE * self.wheelbase  # its fields come before this one
+            wanted = _wanted(field.name, value)
             if wanted is not None:
                 raise ValueError(
                     f"vehicle {shown(self.name)}: {field.name} must be {wanted}, not {shown(value)}"
                 )
-            if not isinstance(value, str | tuple | list | int | float):  # of NumPy or PyTorch
-                object.__setattr__(self, field.name, float(value))
+            if field.name.endswith("_range"):
+                value = (float(value[0]), float(value[1]))
+            elif not isinstance(value, str | int | float):  # of NumPy or PyTorch
+                value = float(value)
+            object.__setattr__(self, field.name, value)
         check_plausible(vars(self))
         check_computable(vars(self))
 
@@ -136,6 +154,16 @@ class VehicleParameters:
     def wheelbase(self) -> float:
         """Distance lf + lr between the axles, m."""
         return self.front_axle_distance + self.rear_axle_distance
+
+    @property
+    def lowest_speed(self) -> float:
+        """Speed at which brakes hold the vehicle, m/s: 0, or -inf for one that reverses."""
+        return 0.0 if self.speed_range[0] >= 0.0 else -math.inf
+
+    @property
+    def lowest_start(self) -> float:
+        """Lowest speed of a start, m/s: standstill, or that of a vehicle that reverses."""
+        return min(self.speed_range[0], 0.0)
 
     @property
     def rolling_deceleration(self) -> float:
@@ -151,6 +179,25 @@ class VehicleParameters:
         caf, car = self.front_cornering_stiffness, self.rear_cornering_stiffness
         lf, lr = self.front_axle_distance, self.rear_axle_distance
         return self.mass * (lr * car - lf * caf) / (self.wheelbase * caf * car)
+
+    def sharpest_turns(self, speed: Array) -> tuple[Array, Array]:
+        """Return the largest curvatures of steady turns at speeds vx (n,), 1/m, shape (n,).
+
+        The first is limited by `max_steering_angle`, the second by `max_lateral_velocity_ratio`: in
+        a steady turn vy = b r with b = lr - m vx^2 lf/(L Car), and the steering angle is
+        (L + K vx^2) r/vx with the understeer gradient K; the curvature is r/sqrt(vx^2 + vy^2).
+        """
+        squared = speed * speed
+        lever = self.rear_axle_distance - squared * (
+            self.mass * self.front_axle_distance / self.wheelbase / self.rear_cornering_stiffness
+        )
+        steered = np.maximum(self.wheelbase + self.understeer_gradient * squared, 1e-9)
+        by_steering = self.max_steering_angle / steered
+        by_sideslip = self.max_lateral_velocity_ratio / np.maximum(np.abs(lever), 1e-9)
+        return (
+            by_steering / np.hypot(1.0, by_steering * lever),
+            by_sideslip / np.hypot(1.0, by_sideslip * lever),
+        )
 
     def as_array(self) -> NDArray[np.float64]:
         """Physical parameters in `PARAMETER_ORDER`, shape (7,), for compiled kernels."""
@@ -172,7 +219,8 @@ COURSE_CAR = VehicleParameters(
     name="course-car",
     source=(
         "public course material on LPV-MPC with the equations and limits of kumar2025lpv: "
-        "m, Iz, lf, lr, Caf, Car, mu"
+        "m, Iz, lf, lr, Caf, Car, mu; height of the centre of gravity: a car's (bmw-320i, "
+        "ford-escort), not the share of a wheelbase of 5 m"
     ),
     mass=1500.0,
     yaw_inertia=3000.0,
@@ -183,13 +231,15 @@ COURSE_CAR = VehicleParameters(
     rolling_resistance=0.02,
     length=5.8,
     width=1.9,
+    centre_of_gravity_height=0.56,
 )
 
 M2_MINIBUS = VehicleParameters(
     name="m2-minibus",
     source=(
         "this project's estimate of the M2 minibus (up to 5 t) of kumar2025lpv, "
-        "whose parameters were not published"
+        "whose parameters were not published; height of the centre of gravity: 0.27 of the "
+        "wheelbase, between CommonRoad's cars (0.23) and its smaller, higher van (0.30)"
     ),
     mass=3500.0,
     yaw_inertia=8000.0,
@@ -200,6 +250,7 @@ M2_MINIBUS = VehicleParameters(
     rolling_resistance=0.02,
     length=5.5,
     width=2.0,
+    centre_of_gravity_height=0.9,
 )
 
 TYRE_STIFFNESS_PER_LOAD = 21.92
@@ -217,6 +268,7 @@ def _commonroad(
     max_steering_angle: float,
     length: float,
     width: float,
+    centre_of_gravity_height: float,
 ) -> VehicleParameters:
     """Make a vehicle of CommonRoad's manual, with tyres linearised at zero slip and static load.
 
@@ -231,8 +283,8 @@ def _commonroad(
         name=name,
         source=(
             f"{car} of M. Althoff, G. Würsching, 'CommonRoad: Vehicle Models', 2020, Tab. 6 "
-            "(m, a, b, I_z, l, w, steering limits), as in commonroad-vehicle-models 3.0.2; "
-            "Caf, Car: its tyre's slope -p_ky1 (Tab. 7) at the axles' static loads"
+            "(m, a, b, I_z, l, w, steering limits) and h_cg, as in commonroad-vehicle-models "
+            "3.0.2; Caf, Car: its tyre's slope -p_ky1 (Tab. 7) at the axles' static loads"
         ),
         mass=mass,
         yaw_inertia=yaw_inertia,
@@ -245,6 +297,7 @@ def _commonroad(
         max_steering_rate=0.4,
         length=length,
         width=width,
+        centre_of_gravity_height=centre_of_gravity_height,
     )
 
 
@@ -258,6 +311,7 @@ FORD_ESCORT = _commonroad(
     max_steering_angle=0.91,
     length=4.298,
     width=1.674,
+    centre_of_gravity_height=0.5577840000000001,
 )
 
 BMW_320I = _commonroad(
@@ -270,6 +324,7 @@ BMW_320I = _commonroad(
     max_steering_angle=1.066,
     length=4.508,
     width=1.61,
+    centre_of_gravity_height=0.5748689544000001,
 )
 
 VW_VANAGON = _commonroad(
@@ -282,6 +337,7 @@ VW_VANAGON = _commonroad(
     max_steering_angle=1.023,
     length=4.569,
     width=1.844,
+    centre_of_gravity_height=0.7478167416,
 )
 
 VEHICLES: dict[str, VehicleParameters] = {

@@ -3,9 +3,10 @@
 `load(name_or_file)` gives a `ReferencePath`; `names()` lists what ships.
 """
 
-from trajectories.catalog import PUBLISHED, load, names, random_path
+from trajectories.catalog import PUBLISHED, load, names
 from trajectories.curvature import CurvatureBands, PathStatistics, statistics
 from trajectories.path import Preview, Projection, ReferencePath
+from trajectories.random_paths import random_path
 from trajectories.speed import SpeedLimits, plan_speed
 
 __all__ = [

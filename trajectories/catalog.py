@@ -10,18 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trajectories import files, shapes
-from trajectories.arguments import Whole, flag, instance_of, shown
+from trajectories.arguments import instance_of, shown
 from trajectories.curvature import PathStatistics, signed_waypoint_curvature
 from trajectories.naming import suggestion
 from trajectories.path import SPACING, ReferencePath
+from trajectories.random_paths import GENERATOR, limit_path, random_path
 from trajectories.speed import SpeedLimits, plan_speed
 
 Array = NDArray[np.float64]
 
 KMH = 1.0 / 3.6
-GENERATOR = "segments/1"
-SEED = Whole(0, 2**128 - 1)
-"""Rule of the seed of a random path."""
 SEED_DIGITS = 40
 """Most digits of the seed of a random path."""
 
@@ -75,16 +73,26 @@ PUBLISHED: dict[str, Published] = {
 }  # fmt: skip
 """The paper's six trajectories; it published no paths, so the segments are this project's."""
 
-ANALYTIC = ("straight", "circle", "figure-eight", "double-lane-change", "sine", "u-turn")
+ANALYTIC = (
+    "straight", "circle", "figure-eight", "double-lane-change", "sine", "u-turn", "hairpins",
+)  # fmt: skip
+RANDOM = ("random", "random-fast", "random-limit")
+"""Kinds of random paths, named KIND-SEED."""
 SHAPE_LIMITS = SpeedLimits(
     max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5, end_speed=3.0
 )
+HAIRPIN_LIMITS = SpeedLimits(
+    max_speed=28.0, max_lateral_acceleration=4.0, max_acceleration=2.0, max_deceleration=3.5,
+    max_jerk=3.0, end_speed=28.0,
+)  # fmt: skip
+"""Limits of `hairpins`, which is entered and left at 28 m/s."""
 
 
 def names() -> list[str]:
-    """Names that `load` knows; it also loads random-SEED and random-fast-SEED for any SEED >= 0."""
+    """Names that `load` knows; it also loads each of `RANDOM` with any other SEED >= 0."""
     return [
-        *PUBLISHED, *(f"{name}-raw" for name in PUBLISHED), *ANALYTIC, "random-0", "random-fast-0",
+        *PUBLISHED, *(f"{name}-raw" for name in PUBLISHED), *ANALYTIC,
+        *(f"{kind}-0" for kind in RANDOM),
     ]  # fmt: skip
 
 
@@ -110,19 +118,21 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
     if name in ANALYTIC:
         return _analytic(name)
     kind, _, seed = name.rpartition("-")
-    if kind in {"random", "random-fast"} and seed.isdecimal():
+    if kind in RANDOM and seed.isdecimal():
         if len(seed) > SEED_DIGITS:
             raise ValueError(f"trajectory {shown(name)}: a seed has at most {SEED_DIGITS} digits")
-        return _random(int(seed), kind == "random-fast")
+        return _random(kind, int(seed))
     if name.endswith(".csv") or os.path.isfile(name):  # noqa: PTH113  Path's raises for long names
         return files.read(Path(name))
-    known = suggestion(name, names(), " and both with any other seed")
+    known = suggestion(name, names(), " and the random ones with any other seed")
     raise ValueError(f"unknown trajectory {shown(name)}; {known}, or give a .csv file")
 
 
 @lru_cache(maxsize=256)
-def _random(seed: int, fast: bool) -> ReferencePath:
-    return random_path(seed, fast=fast)
+def _random(kind: str, seed: int) -> ReferencePath:
+    if kind == "random-limit":
+        return limit_path(seed)
+    return random_path(seed, fast=kind == "random-fast")
 
 
 def _limits(rows: PathStatistics) -> SpeedLimits:
@@ -230,12 +240,16 @@ def _kinked(x: Array, y: Array, spacing: float, name: str) -> ReferencePath:
 
 @cache
 def _analytic(name: str) -> ReferencePath:
-    closed = False
+    closed, limits = False, SHAPE_LIMITS
     if name == "straight":
         geometry = shapes.build(shapes.parse("S 200"))
     elif name == "u-turn":
         segments = shapes.parse("S 40 | L 180 r10 | S 40")
-        geometry = shapes.build(shapes.fit(segments, SHAPE_LIMITS))
+        geometry = shapes.build(shapes.fit(segments, limits))
+    elif name == "hairpins":
+        limits = HAIRPIN_LIMITS
+        segments = shapes.parse("S 250 | L 180 r12 | S 450 | R 180 r12 | S 250")
+        geometry = shapes.build(shapes.fit(segments, limits))
     elif name == "circle":
         geometry, closed = shapes.parametric(_circle, 2.0 * math.pi), True
     elif name == "figure-eight":
@@ -244,9 +258,7 @@ def _analytic(name: str) -> ReferencePath:
         geometry = shapes.parametric(_sine, 160.0)
     else:
         geometry = shapes.parametric(_double_lane_change, 165.0)
-    return shapes.from_geometry(
-        geometry, SHAPE_LIMITS, name, closed=closed, source=f"analytic: {name}"
-    )
+    return shapes.from_geometry(geometry, limits, name, closed=closed, source=f"analytic: {name}")
 
 
 def _circle(t: Array) -> shapes.Derivatives:
@@ -290,49 +302,3 @@ def _double_lane_change(t: Array) -> shapes.Derivatives:
         dy += sign * offset * 30.0 * u**2 * (1.0 - u) ** 2 / span
         ddy += sign * offset * 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) / span**2
     return t, y, np.ones_like(t), dy, np.zeros_like(t), ddy
-
-
-def random_path(
-    seed: int | np.random.Generator, *, length: float | None = None, fast: bool = False
-) -> ReferencePath:
-    """Draw a drivable path for training: turns of 9 to 60 m radius between straights.
-
-    The same seed gives the same path. Speed limits are drawn too: 6 to 14 m/s (`fast`: 10 to 18),
-    1.0 to 2.0 m/s^2 laterally, 1.3 to 2.0 m/s^2 longitudinally. Straights are 8 to 120 m long
-    (`fast`: 40 to 400). Unless given, `length` (m) is drawn from 300 to 600 (`fast`: 600 to 1000).
-
-    Raises
-    ------
-    ValueError
-        If `length` does not keep to `shapes.LENGTHS`, or the seed is no whole number.
-    """
-    alone = isinstance(seed, np.random.Generator)
-    seed = seed if isinstance(seed, np.random.Generator) else SEED.of("seed", seed)
-    fast = flag("fast", fast)
-    rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
-    kind = "random-fast" if fast else "random"
-    speeds, straights, lengths = (
-        ((10.0, 18.0), (40.0, 400.0), (600.0, 1000.0))
-        if fast
-        else ((6.0, 14.0), (8.0, 120.0), (300.0, 600.0))
-    )
-    limits = SpeedLimits(
-        max_speed=float(rng.uniform(*speeds)),
-        max_lateral_acceleration=float(rng.uniform(1.0, 2.0)),
-        max_acceleration=float(rng.uniform(1.3, 2.0)),
-    )
-    wanted = float(rng.uniform(*lengths)) if length is None else shapes.LENGTHS.of("length", length)
-    segments = [shapes.Segment(length=float(rng.uniform(20.0, 50.0)))]
-    planned = segments[0].length
-    while planned < wanted:
-        radius = float(np.exp(rng.uniform(np.log(9.0), np.log(60.0))))
-        angle = math.radians(float(rng.uniform(20.0, 110.0 if radius > 12.0 else 95.0)))
-        turn = shapes.Segment(turn=float(rng.choice([-1.0, 1.0])) * angle, radius=radius)
-        straight = shapes.Segment(length=float(np.exp(rng.uniform(*np.log(straights)))))
-        segments += [turn, straight]
-        planned = sum(part.length for part in shapes.fit(segments, limits))
-    return shapes.from_geometry(
-        shapes.build(shapes.fit(segments, limits)), limits, kind if alone else f"{kind}-{seed}",
-        source=f"{kind} segments" if alone else f"{kind} segments, seed {seed}",
-        generator=GENERATOR,
-    )  # fmt: skip

@@ -21,7 +21,7 @@ from trajectories.curvature import circle_curvature, signed_waypoint_curvature, 
 from trajectories.fileio import checked, parse_json, write_atomically
 from trajectories.importers import read_gps, read_racetrack, read_xy
 from trajectories.path import ReferencePath
-from trajectories.speed import SpeedLimits, plan_speed
+from trajectories.speed import SpeedLimits, replanned
 from trajectories.text_table import COLUMNS, TextTable, read_lines, read_table
 
 __all__ = ["read", "read_gps", "read_native", "read_racetrack", "read_xy", "write"]
@@ -159,10 +159,9 @@ def read_native(
     _check_motion(path, columns, table)
     if limits is not None:
         try:
-            speed = plan_speed(path.curvature, path.spacing, limits, closed=closed)
+            path = replanned(path, limits)
         except (RuntimeError, ValueError) as error:
             table.fail(str(error))
-        path = path.with_speed(speed, limits=asdict(limits))
     return path
 
 

@@ -32,8 +32,8 @@ SMOOTHING = 0.05
 0.162 to 0.104 1/m)."""
 GPS_SMOOTHING = 0.2
 """m rms."""
-MAX_STEERING_ANGLE = math.pi / 6
-"""rad, as in the constraint table of kumar2025lpv."""
+SHARP = 0.115
+"""Curvature from which a bend is warned of, 1/m: a wheelbase of 5 m steers it with 30 degrees."""
 
 DUPLICATE = 1e-3
 """m: points closer than this to the one before are merged."""
@@ -215,6 +215,11 @@ def _times(table: TextTable, index: int) -> Array:
     return stamps
 
 
+def imported(path: ReferencePath) -> bool:
+    """Return whether a path was made of points that somebody measured or drew."""
+    return "rms_deviation" in path.metadata
+
+
 @dataclass
 class _Importer:
     """Make a path from the points of one file: checks, spline, speed profile, warnings."""
@@ -260,7 +265,8 @@ class _Importer:
         self._check_steps(points, closed)
         smoothed = smooth(points, self.smoothing, closed=closed)
         geometry = smoothed.geometry
-        self._check_curve(geometry, closed)
+        for oddity in oddities(geometry, closed):
+            self.warn(oddity)
         try:
             return from_geometry(
                 geometry, self.limits, label, closed=closed,
@@ -335,24 +341,24 @@ class _Importer:
                 f"the median is {median:.2f} m"
             )
 
-    def _check_curve(self, geometry: Geometry, closed: bool) -> None:
-        """Warn of bends that no vehicle can steer, and of branches close to each other."""
-        curvature = np.abs(geometry.curvature)
-        sharpest = int(np.argmax(curvature))
-        steerable = math.tan(MAX_STEERING_ANGLE) / self.limits.wheelbase
-        if curvature[sharpest] > steerable:
-            self.warn(
-                f"curvature {curvature[sharpest]:.3f} 1/m at {geometry.arc_length[sharpest]:.1f} m"
-                f" is beyond the {steerable:.3f} 1/m that a wheelbase of "
-                f"{self.limits.wheelbase:g} m can steer: accepted, speed lowered; more smoothing "
-                "may help"
-            )
-        near = self_approach(geometry, closed)
-        if near is not None:
-            self.warn(
-                f"the path comes within {near[2]:.2f} m of itself, at {near[0]:.1f} m and "
-                f"{near[1]:.1f} m: project with the last arc length at hand"
-            )
+
+def oddities(geometry: Geometry, closed: bool) -> list[str]:
+    """Describe what is accepted but unusual: a sharp bend, branches close to each other."""
+    found = []
+    curvature = np.abs(geometry.curvature)
+    sharpest = int(np.argmax(curvature))
+    if curvature[sharpest] > SHARP:
+        found.append(
+            f"bend of {1.0 / curvature[sharpest]:.1f} m radius at "
+            f"{geometry.arc_length[sharpest]:.1f} m: more smoothing may widen it"
+        )
+    near = self_approach(geometry, closed)
+    if near is not None:
+        found.append(
+            f"the path comes within {near[2]:.2f} m of itself, at {near[0]:.1f} m and "
+            f"{near[1]:.1f} m: project with the last arc length at hand"
+        )
+    return found
 
 
 def self_approach(geometry: Geometry, closed: bool) -> tuple[float, float, float] | None:

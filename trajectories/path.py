@@ -252,6 +252,28 @@ class ReferencePath:
             name=f"{self.name}-mirrored",
         )  # fmt: skip
 
+    def section(self, start: float, end: float) -> "ReferencePath":
+        """Return the open path from arc length `start` to `end`, m, at the nearest nodes.
+
+        Raises
+        ------
+        ValueError
+            If it is not within the path, or has fewer than 4 nodes.
+        """
+        _finite("section", (start, end))
+        if not 0.0 <= start < end <= self.length + 0.5 * self.spacing:
+            raise ValueError(
+                f"path {shown(self.name)}: section {start:g} to {end:g} m is not within its "
+                f"{self.length:.6g} m"
+            )
+        nodes = slice(round(start / self.spacing), round(end / self.spacing) + 1)
+        return ReferencePath(
+            self.arc_length[nodes] - self.arc_length[nodes.start],
+            self.x[nodes], self.y[nodes], self.heading[nodes], self.curvature[nodes],
+            self.speed[nodes], f"{self.name}-{start:g}-{end:g}",
+            metadata={**self.metadata, "section": [start, end]},
+        )  # fmt: skip
+
     def __getstate__(self) -> dict[str, Any]:
         cached = {"table", "time", "acceleration"}
         return {key: value for key, value in self.__dict__.items() if key not in cached}

@@ -7,7 +7,7 @@ tightens it, and every iterate is feasible (Lipp and Boyd, Minimum-time speed op
 fixed path, 2014, for the variable b; the linearisation of the jerk bound is this project's).
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from trajectories.path import MINIMUM_POINTS, ReferencePath
 
 Array = NDArray[np.float64]
 
+GRAVITY = 9.81
+"""m/s^2."""
 GRID = 1.0
 """Largest spacing of the linear programmes' grid, m."""
 ITERATIONS = 6
@@ -180,6 +182,18 @@ def plan_speed(
     smoothed = _smooth(squared, fine * (cells / length))
     planned: Array = np.sqrt(np.minimum(smoothed, limits.max_speed**2))
     return planned
+
+
+def replanned(path: ReferencePath, limits: SpeedLimits) -> ReferencePath:
+    """Return the same geometry with the profile that `limits` allow, which its metadata name.
+
+    Raises
+    ------
+    RuntimeError, ValueError
+        As `plan_speed`.
+    """
+    speed = plan_speed(path.curvature, path.spacing, limits, closed=path.closed)
+    return path.with_speed(speed, limits=asdict(limits))
 
 
 def _check_length(length: float) -> None:

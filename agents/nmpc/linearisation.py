@@ -142,7 +142,7 @@ def _rates(
     q, slope = compiled_inverse_speed(vx), compiled_inverse_speed_slope(vx)
     return (
         compiled_field(vx, vy, r, c, s, a, delta, cd, sd, q, m, iz, lf, lr, caf, car, mu),
-        compiled_jacobian(vx, vy, r, delta, cd, sd, q, slope, m, iz, lf, lr, caf, car, mu),
+        compiled_jacobian(vx, vy, r, delta, cd, sd, q, slope, m, iz, lf, lr, caf, car, mu, caf),
     )
 
 

@@ -19,7 +19,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--suite",
         default="paper",
-        help="paper (default), quick, realtime, learned, plants, converged, sideslip or frozen",
+        help="paper (default), quick, realtime, learned, plants, limits, converged, sideslip or "
+        "frozen",
     )
     shared.add_agents(parser, "default: all; your own: file.py:Class, policy.json")
     shared.add_trajectories(parser, None, "instead of a suite's: names or files")

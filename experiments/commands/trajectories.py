@@ -1,22 +1,23 @@
 """`lpv-track trajectories`: published against achieved rows of paths, drawn and written."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 
+from experiments.commands import options as shared
 from experiments.commands.options import file_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Normalize
 
-    from trajectories import ReferencePath
+    from trajectories import ReferencePath, SpeedLimits
 
-EXAMPLE = "lpv-track trajectories --draw trajectories.png --write paths"
+EXAMPLE = "lpv-track trajectories random-3 --plan grip=0.7 max_speed=30 --write paths"
 
 ROWS = (
     ("max_speed", "max speed", "m/s", ".2f"),
@@ -41,6 +42,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "names", nargs="*", metavar="NAME", help="default: the six and their raw forms"
     )
+    parser.add_argument(
+        "--section", nargs=2, type=shared.number(0.0, unit="m"), metavar=("START", "END"),
+        help="only the part between these arc lengths, m, as an open path",
+    )  # fmt: skip
+    shared.add_settings(
+        parser, "--plan",
+        "plan the speed anew: limits of trajectories.SpeedLimits, in SI units, the path's own "
+        "where none is given; grip=0.7 is max_lateral_acceleration=6.867, 0.7 g",
+    )  # fmt: skip
     parser.add_argument("--draw", type=file_name, metavar="FILE", help="picture, .png or .svg")
     parser.add_argument("--write", type=file_name, metavar="DIR", help="write native CSV files")
 
@@ -49,9 +59,15 @@ def run(options: argparse.Namespace, console: Console) -> int:
     """Print the table of the paths, draw and write them as asked, and return 0."""
     import trajectories
     from experiments.run.suites import RAW, SIX
+    from trajectories.speed import replanned
 
     names = options.names or [*SIX, *RAW]
     paths = [trajectories.load(name) for name in names]
+    if options.section is not None:
+        paths = [path.section(*options.section) for path in paths]
+    if options.plan:
+        given = shared.parse_settings(options.plan)
+        paths = [replanned(path, limits_of(path, given)) for path in paths]
     console.print(rows_table(paths))
     if options.draw is not None:
         draw(paths if options.names else paths[: len(SIX)], options.draw)
@@ -66,6 +82,42 @@ def run(options: argparse.Namespace, console: Console) -> int:
             f"{len(paths)} paths written to {options.write}", markup=False, soft_wrap=True
         )
     return 0
+
+
+def limits_of(path: "ReferencePath", given: Mapping[str, Any]) -> "SpeedLimits":
+    """Return the limits of a plan: those given by name, and the path's own for the others.
+
+    `grip` is the lateral acceleration as a share of g. Longitudinal accelerations keep to their own
+    limits, whatever grip a turn takes.
+
+    Raises
+    ------
+    ValueError
+        For an unknown limit, a value that `SpeedLimits` refuses, or one that is missing because the
+        path has no limits.
+    """
+    from dataclasses import MISSING, fields
+
+    from trajectories import SpeedLimits
+    from trajectories.arguments import Number, shown
+    from trajectories.naming import choose
+    from trajectories.speed import GRAVITY
+
+    known = fields(SpeedLimits)
+    lateral = "max_lateral_acceleration"
+    for key in given:
+        choose("limit in --plan", key, ("grip", *(field.name for field in known)))
+    values = {**path.metadata.get("limits", {}), **given}
+    if "grip" in values:
+        if lateral in given:
+            raise ValueError(f"--plan: give grip or {lateral}, not both")
+        values[lateral] = GRAVITY * Number(1e-3, 100.0).of("grip", values.pop("grip"))
+    needed = [field.name for field in known if field.default is MISSING]
+    if missing := [name for name in needed if name not in values]:
+        raise ValueError(
+            f"path {shown(path.name)} has no limits of its own: --plan needs {', '.join(missing)}"
+        )
+    return SpeedLimits(**values)
 
 
 def _file_names(paths: Sequence["ReferencePath"]) -> dict[str, "ReferencePath"]:

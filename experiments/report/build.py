@@ -12,7 +12,7 @@ from experiments.report.drive_figures import figure_sections
 from experiments.report.drives import NO_FILES, NamedFiles, drives_of, in_families
 from experiments.report.page import Document, html_table, joined, line_styles, paragraph
 from experiments.report.sideslip import sideslip_section
-from experiments.report.summary import failures_section, summary_section
+from experiments.report.summary import failures_section, regime_section, summary_section
 from experiments.run import tables
 from experiments.run.result_schema import read_driven
 from experiments.run.store import ResultStore
@@ -111,6 +111,7 @@ def build(
     notes = joined([skipped_note(skipped), closed_note(kept, files)])
     summary = summary_section(document, kept, len(cases) - len(kept))
     document.section("Summary", joined([notes, summary]))
+    document.section("By regime", regime_section(document, kept))
     figure_sections(document, drives, missing, styles)
     document.section("Replay", drive_replay.replay_section(drives), printed=False)
     document.section("Against the published table", comparison_section(document, kept, rows))

@@ -29,7 +29,7 @@ TRACE = (
 """Arrays that a trace must hold to be drawn."""
 LEAD = "lpv-nmpc"
 """Agent whose figures come first, if it has driven."""
-RANDOM = re.compile(r"random-(fast-)?\d{1,18}")
+RANDOM = re.compile(r"random-((fast|limit)-)?\d{1,18}")
 """Names of random paths."""
 
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from experiments.report.drives import LEAD, family_of, main_family, per_setting
-from experiments.report.page import Document, html_table, joined, paragraph
-from experiments.run import tables
+from experiments.report.page import Cell, Document, html_table, joined, paragraph
+from experiments.run import regimes, tables
 from experiments.run.console_tables import (
     KEY_FIGURES,
     against_published,
@@ -65,6 +65,41 @@ def summary_section(document: Document, cases: Sequence[Result], superseded: int
         )
     )
     return joined(parts)
+
+
+def regime_section(document: Document, cases: Sequence[Result]) -> str:
+    """Return an overview of all regimes, then a table for each; "" for cases without regimes."""
+    groups = {name: regimes.lines(group) for name, group in regimes.by_regime(cases).items()}
+    if not groups:
+        return ""
+    labels = tables.labels(case for case in cases if case.get("regime"))
+    overview = [[name, *_overview(found, labels)] for name, found in groups.items()]
+    numeric = range(1, len(regimes.HEADINGS))
+    return joined(
+        [
+            paragraph(regimes.NOTE),
+            document.table(
+                "Failed drives of all drives, and below them MLE (m) of those that finished.",
+                html_table(("regime", *labels), overview, range(1, len(labels) + 1), (0,)),
+            ),
+            *(
+                document.table(
+                    f"Every agent, {name}.",
+                    html_table(regimes.HEADINGS, [line.cells for line in found], numeric),
+                )
+                for name, found in groups.items()
+            ),
+        ]
+    )
+
+
+def _overview(found: Sequence[regimes.Line], labels: Sequence[str]) -> list[Cell]:
+    """Return a cell for each agent: its failures, and its MLE in small print."""
+    own = {line.label: line for line in found}
+    return [
+        (f"{line.failed} of {line.drives}", line.cells[3]) if (line := own.get(label)) else "–"
+        for label in labels
+    ]
 
 
 def tiles(shown: Iterable[Tile]) -> str:

@@ -17,7 +17,7 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 
 from experiments.ros.read import BagError, Reading, info, read
 from experiments.ros.topics import Datum, Fixes, GeoPoint, Odometry
-from trajectories.importers import IMPORT_LIMITS, MAX_STEERING_ANGLE, self_approach
+from trajectories.importers import oddities
 from trajectories.path import ReferencePath
 from trajectories.shapes import Geometry, from_geometry, largest_penalty, smooth
 from trajectories.speed import SpeedLimits
@@ -163,7 +163,7 @@ def _line(
     noise = float(np.sqrt(np.mean(distance**2)))
     at, chain = _resampled(splines, time)
     shape = smooth(chain + centre, max(SHAPE_TOLERANCE, SHAPE_SHARE * noise))
-    warnings.extend(_oddities(shape.geometry, limits or IMPORT_LIMITS))
+    warnings.extend(oddities(shape.geometry, closed=False))
     metadata.update(
         smoothing="cross-validated" if smoothing is None else smoothing,
         rms_deviation=noise, max_deviation=float(distance.max()),
@@ -266,24 +266,3 @@ def _recorded_speed(
     along *= geometry.arc_length[-1] / along[-1]  # chords are shorter than arcs
     interpolated: Array = np.interp(geometry.arc_length, along, np.maximum(speed, LEAST_SPEED))
     return interpolated
-
-
-def _oddities(geometry: Geometry, limits: SpeedLimits) -> list[str]:
-    """Return warnings about a path that is accepted but unusual."""
-    warnings = []
-    curvature = np.abs(geometry.curvature)
-    sharpest = int(np.argmax(curvature))
-    steerable = math.tan(MAX_STEERING_ANGLE) / limits.wheelbase
-    if curvature[sharpest] > steerable:
-        warnings.append(
-            f"curvature {curvature[sharpest]:.3f} 1/m at {geometry.arc_length[sharpest]:.1f} m is "
-            f"beyond the {steerable:.3f} 1/m that a wheelbase of {limits.wheelbase:g} m can steer: "
-            "more smoothing may help"
-        )
-    near = self_approach(geometry, closed=False)
-    if near is not None:
-        warnings.append(
-            f"the path comes within {near[2]:.2f} m of itself, at {near[0]:.1f} m and "
-            f"{near[1]:.1f} m: project with the last arc length at hand"
-        )
-    return warnings

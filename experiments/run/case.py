@@ -39,7 +39,7 @@ from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.reward import RewardWeights
 from lpv_track_env.task import SPEED_MODES
 from lpv_track_env.vehicle import VehicleParameters
-from trajectories.arguments import shortened
+from trajectories.arguments import instance_of, shortened
 from trajectories.compilation import source_digest
 from trajectories.naming import choose
 
@@ -153,7 +153,8 @@ class Case(BaseCase):
     `experiments.run.computing.ComputingTimes`.
     `vehicle_changes` replaces fields of the vehicle, for the plant and the agents' models alike
     (say, a wider `max_lateral_velocity_ratio`); `agent_settings` and `env_settings` are keyword
-    arguments of the agent's class and of the environment.
+    arguments of the agent's class and of the environment. `regime` names what a case is meant to
+    try, such as "slow actuators": tables put the cases of a regime together.
     """
 
     agent: str
@@ -168,6 +169,7 @@ class Case(BaseCase):
     agent_settings: Mapping[str, Any] = field(default_factory=dict)
     env_settings: Mapping[str, Any] = field(default_factory=dict)
     computing: Mapping[str, Any] = field(default_factory=dict)
+    regime: str = ""
 
     @property
     def place(self) -> str:
@@ -191,6 +193,7 @@ class Case(BaseCase):
         if self.agent in agents.names() and isinstance(weights, Mapping):
             weights_from(weights)
         trajectories.load(self.trajectory)
+        instance_of("regime", self.regime, str, "text")
         choose("speed mode", self.speed_mode, SPEED_MODES)
         conditions.load(self.plain_conditions)
         if self.computing and self.conditions == "simulation":

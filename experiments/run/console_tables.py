@@ -11,6 +11,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from experiments.run import regimes
 from experiments.run.learning_cost import words
 from experiments.run.metrics import BANDS, PAPER_SIMULATION, published_row
 from experiments.run.tables import (
@@ -179,7 +180,8 @@ def all_tables(cases: Iterable[Result]) -> RenderableType:
     """
     kept = ordered(current(cases))
     groups = cases_by_setting(kept)
-    parts: list[RenderableType] = []
+    found = regimes.table(kept)
+    parts: list[RenderableType] = [] if found is None else [found]
     for setting, rows in by_setting(build_rows(kept)).items():
         parts += [_tracking(str(setting), rows), _effort(rows)]
         if (curvature := _curvature(groups[setting])) is not None:
@@ -195,10 +197,13 @@ def all_tables(cases: Iterable[Result]) -> RenderableType:
 def screen(cases: Iterable[Result]) -> tuple[RenderableType, bool]:
     """Return tables that fit on a screen, and whether they are all there are.
 
-    A few agents on a few paths get all tables. Of more there are the key figures of every agent, in
-    the first setting and in the next that differs from it only in its conditions.
+    Cases with a regime get the table by regime. Else a few agents on a few paths get all tables. Of
+    more there are the key figures of every agent, in the first setting and in the next that differs
+    from it only in its conditions.
     """
     kept = ordered(current(cases))
+    if (found := regimes.table(kept)) is not None:
+        return found, False
     rows = [row for row in build_rows(kept) if not row.published]
     if len(rows) <= SCREEN:
         return all_tables(kept), True

@@ -78,6 +78,7 @@ class Stored(TypedDict, total=False):
     agent_settings: Settings
     env_settings: Settings
     computing: Computing | None
+    regime: Name
     end: Name | None
     error: Text | None
     seconds: Time

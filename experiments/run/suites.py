@@ -21,12 +21,83 @@ RAW_PREVIEW = {"preview_steps": 30, "preview_period": 0.1}
 LEAST_SEEDS = 10
 HELD_OUT = tuple(f"random-{'fast-' * (seed % 2)}{seed}" for seed in range(20))
 """Random paths that `lpv-track train` uses neither for training nor for validation."""
+LIMIT_PATHS = tuple(f"random-limit-{seed}" for seed in range(100))
+"""Random paths at the limit that `lpv-track train` and `tune` do not take."""
 BESIDE = {"initial_error_range": [0.3, 0.1, 0.5]}
 """Start beside the path; in simulation, a seed changes nothing else."""
 LEARNED = ("ppo", "sac", "bc")
 """Shipped policies; their preview of 1 s is too short to cut the corners of raw waypoints."""
 DEMONSTRATION = "lpv-mpc-frozen"
 """Agent that shows why the frozen form must not be used."""
+
+_CAR = {"vehicles": ("bmw-320i",)}
+_TRUTH = {"name": "realtime", "estimator": "truth"}
+_AT_055_G = {**_CAR, "trajectories": LIMIT_PATHS[1::10]}
+_LANE_CHANGE = {**_CAR, "trajectories": ("double-lane-change",), "speed_modes": ("fixed",)}
+LIMITS: dict[str, list[dict[str, Any]]] = {
+    "0.50 to 0.95 g, drift plant": [
+        {
+            **_CAR, "trajectories": LIMIT_PATHS[:10],
+            "env_settings": {"plant": "drift"},
+        }
+    ],
+    "95 % of grip, brush tyres": [
+        {
+            **_CAR, "trajectories": LIMIT_PATHS[5::10],
+            "conditions": {"name": "ideal", "friction": 0.79},
+        }
+    ],
+    "0.55 g, friction unknown": [
+        {
+            **_AT_055_G, "conditions": {"name": "realtime", "friction": [0.5, 1.0]},
+            "seeds": range(2),
+        }
+    ],
+    "0.55 g, friction unknown, true state": [
+        {**_AT_055_G, "conditions": {**_TRUTH, "friction": [0.5, 1.0]}, "seeds": range(2)}
+    ],
+    "lane changes, 13 to 22 m/s": [
+        {**_LANE_CHANGE, "fixed_speed": speed, "conditions": _TRUTH, "seeds": range(2)}
+        for speed in (13.0, 16.0, 19.0, 22.0)
+    ],
+    "lane change, 20 m/s, friction 0.9": [
+        {
+            **_LANE_CHANGE, "fixed_speed": 20.0, "conditions": {**_TRUTH, "friction": 0.9},
+            "seeds": range(6),
+        }
+    ],
+    "9 m/s round corners, friction 0.8": [
+        {
+            "trajectories": SIX[:4], "speed_modes": ("fixed",), "fixed_speed": 9.0,
+            "conditions": {"name": "ideal", "friction": 0.8},
+        }
+    ],
+    "slow actuators": [
+        {
+            "trajectories": HELD_OUT[:10], "conditions": "realtime",
+            "vehicle_changes": {"max_steering_rate": 0.15, "max_jerk": 1.5},
+        }
+    ],
+    "28 m/s into hairpins": [
+        {"trajectories": ("hairpins",), "conditions": "realtime", "seeds": range(10)}
+    ],
+    "another mass and tyres": [
+        {
+            "trajectories": HELD_OUT[:10],
+            "conditions": {
+                **_TRUTH, "mass_factor": [0.7, 1.5], "inertia_factor": [0.7, 1.5],
+                "front_stiffness_factor": [0.7, 1.3], "rear_stiffness_factor": [0.7, 1.3],
+            },
+        }
+    ],
+}  # fmt: skip
+"""Regimes of the suite `limits`: arguments of `grid`, whose seeds are the fewest that are driven.
+
+Friction 0.79 at 0.75 g of lateral acceleration is 95 % of the grip. At 0.55 g, a draw of the
+friction below 0.55 cannot be held by anybody.
+"""
+REGIMES = tuple(LIMITS)
+"""Names of all regimes, in the order of tables."""
 
 
 def grid(
@@ -146,6 +217,17 @@ def independent(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
     ]
 
 
+def limits(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
+    """The regimes of `LIMITS` with every agent that does not solve to convergence."""
+    _, fast = _by_speed(agent_names)
+    specs = []
+    for regime, grids in LIMITS.items():
+        for one in grids:
+            most = seeds if len(seeds) > len(one.get("seeds", ())) else one["seeds"]
+            specs += grid(fast, **{**one, "seeds": most}, regime=regime)
+    return specs
+
+
 def _several(seeds: Sequence[int]) -> Sequence[int]:
     return seeds if len(seeds) >= LEAST_SEEDS else range(LEAST_SEEDS)
 
@@ -179,6 +261,7 @@ SUITES = {
     "converged": converged,
     "frozen": frozen,
     "plants": independent,
+    "limits": limits,
 }
 
 

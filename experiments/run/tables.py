@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,6 +68,7 @@ class Setting(NamedTuple):
     computing: str
     control_period: float
     env_settings: str
+    regime: str = ""
 
     @property
     def family(self) -> "Setting":
@@ -81,7 +82,7 @@ class Setting(NamedTuple):
 
     def __str__(self) -> str:
         """Title of the setting's tables."""
-        parts = [self.vehicle]
+        parts = [self.regime, self.vehicle] if self.regime else [self.vehicle]
         if changed := json.loads(self.vehicle_changes):
             parts.append(f"with {_changes(changed)}")
         speed = "" if self.fixed_speed is None else f" {self.fixed_speed} m/s"
@@ -116,10 +117,12 @@ def setting_of(case: Result) -> Setting:
         computing=text("computing", {}),
         control_period=case.get("control_period", Case.control_period),
         env_settings=text("env_settings", {}),
+        regime=str(case.get("regime") or ""),
     )
 
 
-DEFAULT = setting_of(Case("", "").as_dict())
+USUAL = Case("", "").as_dict()
+DEFAULT = setting_of(USUAL)
 
 
 def _changes(values: Mapping[str, Any]) -> str:
@@ -264,10 +267,12 @@ def current(cases: Iterable[Result]) -> list[Result]:
     """Return the cases without those that a later one repeats with other sources.
 
     A case's id changes with the project's sources, so a folder that was resumed after a change
-    holds both; averaged, they would count as two seeds.
+    holds both; averaged, they would count as two seeds. Entries that an old result lacks are the
+    default.
     """
-    names = [item.name for item in fields(Case)]
-    latest = {repr([(name, case.get(name)) for name in names]): case for case in cases}
+    latest = {
+        repr([case.get(name, usual) for name, usual in USUAL.items()]): case for case in cases
+    }
     return list(latest.values())
 
 

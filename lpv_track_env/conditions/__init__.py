@@ -107,11 +107,13 @@ class Conditions:
     max_command_age
         Time without a new command, s, after which it brakes, too; by default three control periods.
 
-    Friction limits the lateral force by the brush model (Pacejka, Tire and Vehicle Dynamics,
-    section 3.2); the bicycle gets the secant stiffness at the current slip.
+    Friction limits what the tyres' side forces and the drive or brakes can do together, with the
+    load that braking shifts between the axles: the model of `lpv_track_env.tyres`.
 
     A plant other than the bicycle (`lpv_track_env.plants`) has its own mass, inertia, stiffness,
-    rolling resistance, friction and wind: the fields for these have no effect.
+    rolling resistance and wind: the fields for these have no effect. Friction multiplies the grip
+    of `drift` and `multi-body`, 1.05 on their own road; on plants without such a limit
+    (`single-track`) it has no effect, and the environment warns.
 
     A computation that takes longer than a control period makes the controller miss the next
     deadline: its action is dropped, the command in force is held, and `deadline_misses` counts it.

@@ -6,11 +6,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels as k
-from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, compiled_inverse_speed
+from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.conditions import WIND_LEVER, layout
 from lpv_track_env.draws import gaussian
-from lpv_track_env.integration import integrate
-from lpv_track_env.plausibility import GRAVITY
+from lpv_track_env.integration import integrate, integrate_sliding
+from lpv_track_env.tyres import compiled_constants
 from trajectories.compilation import compiled_in_place, compiled_internal
 
 Array = NDArray[Any]
@@ -76,21 +76,6 @@ def mean_command(m: Array, commands: Array, entry: int, begins: Any, ends: Any) 
     if end > begins:
         total += (end - begins) * value
     return total / (ends - begins)
-
-
-@compiled_internal
-def secant(stiffness: Any, slip: Any, limit: Any) -> Any:
-    """Return the secant stiffness (N/rad) of the brush model at a slip (rad), force limit in N.
-
-    F = C a (1 - z + z^2/3) with z = C |a| / (3 limit) up to z = 1, where the whole contact patch
-    slides. (Pacejka, Tire and Vehicle Dynamics, section 3.2, parabolic pressure.)
-    """
-    if not math.isfinite(limit):
-        return stiffness
-    z = stiffness * abs(slip) / (3.0 * limit)
-    if z < 1.0:
-        return stiffness * (1.0 - z + z * z / 3.0)
-    return limit / abs(slip)
 
 
 @compiled_internal
@@ -177,7 +162,10 @@ def drive_vehicle(
     h = p[k.PERIOD] / substeps
     vx, vy, psi, r = record[VX], record[VY], record[PSI], record[YAW_RATE]
     x, y = record[X], record[Y]
-    load = m[q] * GRAVITY / (m[q + 2] + m[q + 3]) * m[layout.FRICTION]
+    slides = m[layout.FRICTION] < math.inf
+    tyre = compiled_constants(
+        m[layout.FRICTION], p[k.HEIGHT], m[q], m[q + 2], m[q + 3], m[q + 4], m[q + 5]
+    )
     total_a = total_delta = 0.0
     windy = m[layout.WIND_SPEED] > 0.0 or m[layout.GUST_SPEED] > 0.0
     braking = stop_acceleration(m, p)
@@ -185,21 +173,26 @@ def drive_vehicle(
         a, delta = advance_servos(m, commands, braking, now + i * h, h)
         total_a += a
         total_delta += delta
-        wheels = delta + m[layout.STEERING_OFFSET]
-        inverse = compiled_inverse_speed(vx)
-        front = wheels * (vx * inverse) - (vy + m[q + 2] * r) * inverse
-        rear = (m[q + 3] * r - vy) * inverse
+        a /= m[layout.MASS_FACTOR]
+        delta += m[layout.STEERING_OFFSET]
         push = spin = 0.0
         if windy:
             push, spin = side_wind(m, vx, vy, psi)
         # Half of the wind's impulse before the step and half after it: Strang splitting, order 2.
-        vx, vy, psi, r, x, y = integrate(
-            vx, vy + 0.5 * h * push, psi, r + 0.5 * h * spin, x, y,
-            a / m[layout.MASS_FACTOR], wheels,
-            m[q], m[q + 1], m[q + 2], m[q + 3],
-            secant(m[q + 4], front, load * m[q + 3]), secant(m[q + 5], rear, load * m[q + 2]),
-            m[q + 6], h, 1,
-        )  # fmt: skip
+        vy += 0.5 * h * push
+        r += 0.5 * h * spin
+        if slides:
+            vx, vy, psi, r, x, y = integrate_sliding(
+                vx, vy, psi, r, x, y, a, delta,
+                m[q], m[q + 1], m[q + 2], m[q + 3], m[q + 4], m[q + 5], m[q + 6], tyre, h, 1,
+                p[k.LOWEST_SPEED],
+            )  # fmt: skip
+        else:
+            vx, vy, psi, r, x, y = integrate(
+                vx, vy, psi, r, x, y, a, delta,
+                m[q], m[q + 1], m[q + 2], m[q + 3], m[q + 4], m[q + 5], m[q + 6], h, 1,
+                p[k.LOWEST_SPEED],
+            )  # fmt: skip
         vy += 0.5 * h * push
         r += 0.5 * h * spin
     m[layout.MEAN_A], m[layout.MEAN_DELTA] = total_a / substeps, total_delta / substeps

@@ -109,6 +109,7 @@ class EstimatorSettings:
                 self.most_rejected,
                 longest_substep(vehicle),
                 *vehicle.as_array(),
+                vehicle.lowest_speed,
             ]
         )
 

@@ -56,9 +56,11 @@ POSITION_VARIANCE, HEADING_VARIANCE, YAW_RATE_VARIANCE, SPEED_VARIANCE = range(4
 VX_DENSITY, VY_DENSITY, PSI_DENSITY, R_DENSITY, POSITION_DENSITY = 4, 5, 6, 7, 8
 GYRO_DENSITY, HEADING_BIAS_DENSITY, OFFSET_DENSITY = 9, 10, 11
 # gates on the NIS of a fix (2 degrees of freedom) and of a reading (1), rejections in a row after
-# which a reading is used nevertheless, the prediction's step (s), the vehicle's 7 parameters.
+# which a reading is used nevertheless, the prediction's step (s), the vehicle's 7 parameters and
+# its lowest speed (m/s).
 FIX_GATE, READING_GATE, MOST_IN_A_ROW, SUBSTEP, PARAMETERS = 12, 13, 14, 15, 16
-SETTINGS = PARAMETERS + 7
+LOWEST_SPEED = PARAMETERS + 7
+SETTINGS = LOWEST_SPEED + 1
 
 USED, GATED, LATE, DUPLICATE, NOT_FINITE = range(5)
 FIX_RESULTS = ("used", "gated", "late", "duplicate", "not finite")
@@ -115,8 +117,9 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
     wheels = delta + m[STEERING_OFFSET]
     # In the frame of the vehicle at the start: its heading only turns the result.
     nx, ny, turn, nr, ahead, aside = integrate(
-        vx, vy, 0.0, r, 0.0, 0.0, a, wheels, p0, p1, p2, p3, p4, p5, p6, h, substeps
-    )
+        vx, vy, 0.0, r, 0.0, 0.0, a, wheels, p0, p1, p2, p3, p4, p5, p6, h, substeps,
+        s[LOWEST_SPEED],
+    )  # fmt: skip
     # The Jacobian needs fewer steps, enough to resolve the lateral poles; their sum bounds each.
     q = compiled_inverse_speed(vx)
     poles = q * ((p4 + p5) / p0 + (p4 * p2 * p2 + p5 * p3 * p3) / p1)

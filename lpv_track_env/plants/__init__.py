@@ -20,7 +20,7 @@ clip range and rate in the same way for every plant.
 import importlib
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,18 @@ class Plant(Protocol):
         ...
 
 
+@runtime_checkable
+class RoadPlant(Plant, Protocol):
+    """A plant that takes the friction of the conditions: that of its road, by its own."""
+
+    friction: float
+    """Largest side force by load on the plant's own road."""
+
+    def set_friction(self, factor: float) -> None:
+        """Multiply the road's own friction from the next period on; 1 is the plant's own road."""
+        ...
+
+
 Factory = Callable[[VehicleParameters], Plant]
 """A function that makes the plant of a vehicle, for instance the plant's class."""
 
@@ -122,8 +134,19 @@ class PlantEpisode:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
 
-    def begin(self, record: Array) -> None:
-        """Start the plant at the state and steering angle of an episode's record."""
+    def nominal_friction(self, friction: float) -> float:
+        """Return the largest side force by load under the conditions' friction; inf if unknown."""
+        if not isinstance(self.plant, RoadPlant):
+            return math.inf
+        return self.plant.friction * (friction if friction < math.inf else 1.0)
+
+    def begin(self, record: Array, friction: float = math.inf) -> None:
+        """Start the plant at the state and steering angle of an episode's record.
+
+        `friction` multiplies that of the plant's road; inf leaves it.
+        """
+        if isinstance(self.plant, RoadPlant):
+            self.plant.set_friction(friction if friction < math.inf else 1.0)
         self.plant.begin(record[:6].copy(), float(record[kernels.STEERING]))
 
     def advance(self, episode: Array, table: Array, *conditioned: Any) -> tuple[float, ...]:
@@ -131,7 +154,7 @@ class PlantEpisode:
 
         Under conditions these are the arguments of `advance_under_conditions`. Conditions of
         sensors, actuators and commands hold for every plant, but mass, tyres and wind are the
-        plant's own.
+        plant's own, up to a `RoadPlant`'s friction.
         """
         end = kernels.NOT_FINITE
         if math.isfinite(episode[0]) and math.isfinite(episode[1]):

@@ -28,6 +28,10 @@ Left and right
     however small, shifts a tyre's curve by p_hy1 and p_vy1 with its sign. In the multi-body, whose
     wheels lean with its roll, side forces jump by 2 % of the load each way when a wheel's camber
     passes zero; there the integration converges with first order only.
+Friction
+    The Pacejka tyre's own road has peaks of 1.05 sideways (p_dy1) and 1.17 along (p_dx1) by load.
+    The friction of the environment's conditions multiplies both; slopes at zero slip stay. The
+    single-track's tyre is linear and has no limit.
 """
 
 import inspect
@@ -295,7 +299,26 @@ class SingleTrack(_OneTrack):
         return self.tyre_pole(speed)
 
 
-class Drift(_OneTrack):
+class _Pacejka(CommonRoadPlant):
+    """Base of the plants with a Pacejka tyre, whose peaks are the friction of its road."""
+
+    def __init__(self, vehicle: VehicleParameters) -> None:
+        super().__init__(vehicle)
+        tyre = self.parameters.tire
+        self._peaks = float(tyre.p_dx1), float(tyre.p_dy1)
+
+    @property
+    def friction(self) -> float:
+        """Largest side force by load on the tyre's own road."""
+        return self._peaks[1]
+
+    def set_friction(self, factor: float) -> None:
+        """Multiply the road's own friction; see `RoadPlant`."""
+        tyre = self.parameters.tire
+        tyre.p_dx1, tyre.p_dy1 = factor * self._peaks[0], factor * self._peaks[1]
+
+
+class Drift(_Pacejka, _OneTrack):
     """CommonRoad's drift single-track model (std), 9 states: Pacejka tyres, one wheel an axle."""
 
     integrate = staticmethod(drive_drift)
@@ -313,7 +336,7 @@ class Drift(_OneTrack):
         return max(spin, self.tyre_pole(speed))
 
 
-class MultiBody(CommonRoadPlant):
+class MultiBody(_Pacejka):
     """CommonRoad's multi-body model (mb), 29 states: suspension, compliance, four tyres."""
 
     integrate = staticmethod(drive_multi_body)

@@ -120,6 +120,29 @@ def test_a_steady_turn_is_an_equilibrium_on_the_circle(vehicle, speed, curvature
     assert turn.yaw_rate / math.hypot(state[0], state[1]) == pytest.approx(curvature)
 
 
+@pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES)
+@pytest.mark.parametrize("speed", [1.0, 4.0, 8.0])
+def test_the_sharpest_turns_are_the_steady_turns_at_the_limits(vehicle, speed):
+    # Steady turns end at full lock: here the sideslip binds everywhere.
+    wide = vehicle.replace(max_steering_angle=1.5)
+    by_sideslip = wide.sharpest_turns(np.array([speed]))[1][0]
+    assert math.tan(steady_turn(by_sideslip, speed, wide).sideslip) == pytest.approx(
+        vehicle.max_lateral_velocity_ratio * np.sign(lever_of(vehicle, speed)), rel=1e-9
+    )
+    # The steady turn has the cosine of the steering angle, the limit's formula has not.
+    gentle = vehicle.replace(max_steering_angle=0.02)
+    by_steering = gentle.sharpest_turns(np.array([speed]))[0][0]
+    assert steady_turn(by_steering, speed, gentle).steering_angle == pytest.approx(0.02, rel=1e-3)
+
+
+def lever_of(vehicle, speed):
+    """Lateral speed per yaw rate of a steady turn, m."""
+    return vehicle.rear_axle_distance - (
+        vehicle.mass * speed**2 * vehicle.front_axle_distance
+        / (vehicle.wheelbase * vehicle.rear_cornering_stiffness)
+    )  # fmt: skip
+
+
 def test_steady_turns_agree_with_rajamani_for_small_angles():
     vehicle = VEHICLES["course-car"]
     turn = steady_turn(1e-4, 8.0, vehicle)

@@ -394,7 +394,7 @@ def callable_of(target: Target) -> Callable[..., Any]:
 
 def arguments_of(target: Target) -> list[str]:
     """Return the names of its arguments; reset options are among them."""
-    extra = ["arc_length", "lateral_error", "speed_error", "trajectory", "vehicle"]
+    extra = ["arc_length", "lateral_error", "speed_error", "speed", "trajectory", "vehicle"]
     return [
         *(
             name

@@ -522,6 +522,37 @@ def test_trajectories_are_drawn_and_written(
     assert main(["trajectories", str(file)]) == 0
 
 
+def test_a_plan_is_written_and_driven_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, plan = "random-limit-0", ["--plan", "grip=0.4", "max_speed=18", "end_speed=4"]
+    command = ["trajectories", name, "--section", "100", "400", *plan, "--write", str(tmp_path)]
+    assert main(command) == 0
+    file = tmp_path / f"{name}-100-400.csv"
+    path, own = trajectories.load(file), trajectories.load(name).metadata["limits"]
+    assert path.length == pytest.approx(300.0, abs=0.3)
+    assert path.metadata["limits"]["max_lateral_acceleration"] == pytest.approx(0.4 * 9.81)
+    assert path.metadata["limits"]["max_jerk"] == own["max_jerk"]
+    lateral = (path.speed**2 * np.abs(path.curvature)).max()
+    assert lateral == pytest.approx(0.4 * 9.81, rel=0.02)
+    assert path.speed[[0, -1]] == pytest.approx(4.0)
+    run = ["benchmark", "--agents", "stanley", "--trajectories", str(file), "--workers", "1"]
+    assert main([*run, "--out", str(tmp_path / "out")]) == 0
+    (case,) = ResultStore(tmp_path / "out").cases()
+    trace = ResultStore(tmp_path / "out").trace(case["id"])
+    assert trace is not None
+    wanted = path.sample(trace["arc_length"]).speed
+    np.testing.assert_allclose(trace["reference_speed"], wanted, atol=1e-9)
+    capsys.readouterr()
+    for setting, words in (
+        ("gripp=0.7", "nearest: grip"), ("grip=x", "grip must be"),
+        ("max_jerk=-1", "max_jerk must be"), ("max_speed", "is not KEY=VALUE"),
+    ):  # fmt: skip
+        assert words in refused(capsys, "trajectories", "T2", "--plan", setting)
+    both = ("grip=0.5", "max_lateral_acceleration=3")
+    assert "not both" in refused(capsys, "trajectories", "T2", "--plan", *both)
+
+
 def test_the_published_rows_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["trajectories", "T2", "T4-raw"]) == 0
     lines = capsys.readouterr().out.splitlines()

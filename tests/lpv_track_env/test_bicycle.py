@@ -313,7 +313,7 @@ def test_jacobian_is_casadis(car: VehicleParameters) -> None:
     slope = bicycle.inverse_speed_slope_polynomial(ratio / LOW_SPEED, bounded, vx)
     plain = bicycle.jacobian(
         vx, vy, r, delta, np.cos(delta), np.sin(delta), bicycle.inverse_speed(vx), slope,
-        *parameters,
+        *parameters, parameters[4],
     )  # fmt: skip
     compiled = np.empty((12, 2_000))
     for k in range(2_000):
@@ -321,6 +321,7 @@ def test_jacobian_is_casadis(car: VehicleParameters) -> None:
         compiled[:, k] = bicycle.compiled_jacobian(
             one, float(vy[k]), float(r[k]), angle, math.cos(angle), math.sin(angle),
             compiled_inverse_speed(one), bicycle.compiled_inverse_speed_slope(one), *parameters,
+            parameters[4],
         )  # fmt: skip
     sizes = np.maximum(np.abs(exact), np.abs(exact).max(axis=1, keepdims=True) * 1e-3)
     assert_close(np.array(plain), exact, sizes)

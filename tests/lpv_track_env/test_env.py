@@ -4,6 +4,7 @@ import copy
 import inspect
 import math
 import pickle
+import re
 import subprocess
 import sys
 import warnings
@@ -20,7 +21,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import trajectories
-from lpv_track_env import HIGHWAY_TRACK, PATH_TRACKING, WEIGHT_TUNING, kernels
+from lpv_track_env import HIGHWAY_TRACK, PATH_TRACKING, WEIGHT_TUNING, kernels, vehicle
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.highway.env import HighwayTrackEnv
 from lpv_track_env.reward import TERMS, RewardWeights
@@ -484,7 +485,7 @@ def test_as_made_it_is_bare_and_keeps_the_order_of_calls_itself() -> None:
         ({"lateral_error": -20.0}, "left_corridor"),
         ({"heading_error": math.pi}, "wrong_heading"),
         ({"heading_error": -2.0}, "wrong_heading"),
-        ({"lateral_error": 20.0, "heading_error": math.pi, "speed_error": -20.0}, "left_corridor"),
+        ({"lateral_error": 20.0, "heading_error": math.pi, "speed": 0.0}, "left_corridor"),
         ({"lateral_error": 1e9}, "left_corridor"),
     ],
 )
@@ -506,7 +507,8 @@ def test_hopeless_start_ends_with_a_reason(
 @pytest.mark.parametrize("speed", [0.0, -5.0, 40.0, 1e-9])
 @pytest.mark.parametrize("name", VEHICLES)
 def test_any_speed_stays_finite(name: str, speed: float) -> None:
-    env = make(trajectory="circle", vehicle=name, max_lateral_error=1e6)
+    car = vehicle.load(name).replace(speed_range=(-5.0, 30.0))
+    env = make(trajectory="circle", vehicle=car, max_lateral_error=1e6)
     reference = float(env.path.speed[0])
     env.reset(seed=0, options={"speed_error": speed - reference})
     assert env.state[0] == pytest.approx(speed, abs=1e-12)
@@ -687,6 +689,13 @@ BAD_RESETS: dict[str, tuple[dict[str, Any], str]] = {
     "trajectory": ({"trajectory": "T7"}, "unknown trajectory 'T7'"),
     "vehicle": ({"vehicle": "tank"}, "unknown vehicle 'tank'"),
     "late": ({"trajectory": "T2", "lateral_error": math.nan}, "lateral_error must be in"),
+    "reverse": (
+        {"speed_error": -99.0},
+        r"speed_error -99 m/s: .* start at -96 m/s, .*'m2-minibus' drives at 0 .* at least -3$",
+    ),
+    "reverse-there": ({"speed_error": -9.9, "arc_length": 200.0}, r"start at -6.9 m/s"),
+    "reverse-speed": ({"speed": -0.5}, "speed -0.5 m/s: .* at least 0$"),
+    "speed-twice": ({"speed": 1.0, "speed_error": 1.0}, "give one of them"),
 }
 
 
@@ -754,6 +763,10 @@ BAD_ARGUMENTS: dict[str, tuple[dict[str, Any], str]] = {
     "errors": ({"initial_error_range": (1.0, 2.0)}, "initial_error_range must be 3 numbers"),
     "errors-negative": ({"initial_error_range": (1.0, -2.0, 0.0)}, "initial_error_range.+ must be"),
     "errors-nan": ({"initial_error_range": (math.nan, 0.0, 0.0)}, "initial_error_range.+ must be"),
+    "errors-reverse": (
+        {"initial_error_range": (0.0, 0.0, 99.0)},
+        "an error of 99 m/s is more than any speed of path 'straight' .* at most 10 m",
+    ),
     "errors-inf": ({"initial_error_range": (math.inf, 0.0, 0.0)}, "initial_error_range.+ must be"),
 }  # fmt: skip
 
@@ -785,6 +798,45 @@ def test_speed_beyond_the_vehicles_is_lowered_with_a_warning() -> None:
         env = make(trajectory=path)
     assert env.path.speed.max() == 30.0
     assert "speed lowered" in env.path.metadata["warnings"][-1]
+
+
+def right_angle(tmp_path: Path) -> Path:
+    """Two straights of 50 m that meet at a right angle, every 5 m."""
+    along = np.arange(0.0, 51.0, 5.0)
+    points = [*((s, 0.0) for s in along), *((50.0, s) for s in along[1:])]
+    file = tmp_path / "corner.csv"
+    file.write_text("x,y\n" + "".join(f"{x},{y}\n" for x, y in points))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("changes", "limit"),
+    [
+        ({}, r"its limit \|vy\| <= 0.17 vx lets vehicle 'm2-minibus' turn on 10\.\d m or more"),
+        ({"max_lateral_velocity_ratio": 0.5}, r"its steering angle of 0.524 rad .* on 6\.\d m"),
+        ({"max_steering_angle": 0.2}, r"its steering angle of 0.2 rad .* on 16\.\d m"),
+    ],
+)
+def test_a_bend_too_sharp_is_told_with_the_limit_that_binds(
+    tmp_path: Path, changes: dict[str, float], limit: str
+) -> None:
+    file = right_angle(tmp_path)
+    car = M2_MINIBUS.replace(**changes)
+    with pytest.warns(UserWarning, match="bend of") as caught:
+        make(trajectory=str(file), vehicle=car)
+    texts = [str(one.message) for one in caught]
+    assert len(texts) == 2
+    assert "bend of 1.4 m radius at 50.2 m: more smoothing may widen it" in texts[0]
+    assert re.search(rf"'corner': bend of 1.4 m radius at 50.2 m, {limit}", texts[1])
+
+
+def test_a_bend_that_the_vehicle_takes_is_not_told(tmp_path: Path) -> None:
+    nimble = M2_MINIBUS.replace(max_lateral_velocity_ratio=1.9, max_steering_angle=1.5,
+                                rear_axle_distance=0.4, front_axle_distance=0.4,
+                                implausible=True)  # fmt: skip
+    with pytest.warns(UserWarning, match="more smoothing") as caught:
+        make(trajectory=str(right_angle(tmp_path)), vehicle=nimble)
+    assert len(caught) == 1
 
 
 def test_frames_are_as_many_as_control_periods() -> None:

@@ -70,7 +70,7 @@ def test_a_draw_is_not_moved_by_another() -> None:
 def test_start_lies_at_the_errors_asked_for() -> None:
     env = PathTrackingEnv("circle")
     record, observation = np.full(kernels.RECORD_SIZE, 7.0), np.zeros(48, np.float32)
-    given = np.array([12.0, 0.5, -0.2, 1.5])
+    given = np.array([12.0, 0.5, -0.2, 1.5, math.nan])
     episodes.begin(
         record, env.task.constants(), env.path.table, observation,
         np.uint64(0), 0, given,

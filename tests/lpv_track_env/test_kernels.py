@@ -187,6 +187,7 @@ def test_layout_of_memory_and_constants() -> None:
         "LATERAL_RANGE": 0.1,
         "HEADING_RANGE": 0.2,
         "SPEED_RANGE": 0.3,
+        "LOWEST_SPEED": 0.0,
     }
     for name, value in wanted.items():
         assert packed[getattr(kernels, name)] == value, name

@@ -7,6 +7,7 @@ import copy
 import math
 import pickle
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -16,10 +17,12 @@ import pytest
 from numpy.typing import NDArray
 
 import agents
+import trajectories
 from experiments.cli import main
 from experiments.run.case import run_case
 from lpv_track_env import plants
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, derivative
+from lpv_track_env.conditions import IDEAL, Conditions
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.integration import integrate
 from lpv_track_env.plausibility import GRAVITY
@@ -72,6 +75,7 @@ def test_presets_are_the_packages(vehicle: str) -> None:
     car, given = VEHICLES[vehicle], setup_vehicle_parameters(VEHICLE_IDS[vehicle])
     assert (car.mass, car.yaw_inertia) == (given.m, given.I_z)
     assert (car.front_axle_distance, car.rear_axle_distance) == (given.a, given.b)
+    assert car.centre_of_gravity_height == given.h_cg
     assert (car.length, car.width) == (given.l, given.w)
     assert (-car.max_steering_angle, car.max_steering_angle) == (
         given.steering.min, given.steering.max,
@@ -357,6 +361,60 @@ class SameBicycle:
             period / substeps, substeps,
         )  # fmt: skip
         return np.array(self.state)
+
+
+@pytest.mark.parametrize("name", ["drift", "multi-body"])
+def test_friction_multiplies_the_roads_grip(name: str) -> None:
+    """A circle at 0.6 g is held on the tyre's own road, and lost with 0.4 of its grip."""
+    path = trajectories.load("circle")
+    path = path.with_speed(math.sqrt(0.6 * GRAVITY / path.curvature.max()))
+
+    def end(friction: float) -> tuple[str, float]:
+        env = PathTrackingEnv(
+            path, "bmw-320i", plant=name, time_limit=30.0,
+            conditions=Conditions(estimator="truth", friction=friction),
+        )  # fmt: skip
+        assert env.friction == pytest.approx(1.0489 * min(friction, 1.0) ** (friction < math.inf))
+        agent = agents.make("stanley", env)
+        observation, _ = env.reset(seed=0)
+        for _ in range(600):
+            observation, _, terminated, truncated, info = env.step(agent.predict(observation)[0])
+            if terminated or truncated:
+                break
+        return str(info["end"]), float(info["state"][VX])
+
+    assert end(0.4)[0] == "left_corridor"
+    assert end(1.0)[0] == "finished"
+    assert end(math.inf) == end(1.0)
+
+
+@pytest.mark.parametrize("friction", [0.5, (0.4, 0.9)])
+def test_a_plant_that_takes_no_friction_is_told(friction: Any) -> None:
+    conditions = Conditions(friction=friction)
+    with pytest.warns(UserWarning, match="has no effect on plant 'single-track'") as caught:
+        env = PathTrackingEnv("T1", "bmw-320i", plant="single-track", conditions=conditions)
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
+    assert env.friction == math.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        PathTrackingEnv("T1", "bmw-320i", plant="drift", conditions=conditions)
+        PathTrackingEnv("T1", "bmw-320i", plant="single-track", conditions=IDEAL)
+
+
+def test_drawn_friction_reaches_the_plant() -> None:
+    env = PathTrackingEnv(
+        "T1", "bmw-320i", plant="drift", conditions=Conditions(friction=(0.3, 0.9))
+    )
+    peaks = []
+    for _ in range(20):
+        env.reset(seed=0 if not peaks else None)
+        plant: Any = env._plant and env._plant.plant
+        peaks.append(plant.parameters.tire.p_dy1 / 1.0489)
+        assert plant.parameters.tire.p_dx1 == pytest.approx(1.1739 * peaks[-1])
+    assert 0.3 <= min(peaks) < 0.45
+    assert 0.75 < max(peaks) <= 0.9
+    assert env.friction == pytest.approx(0.3 * 1.0489)
 
 
 def test_all_but_the_plant_is_the_same_code() -> None:

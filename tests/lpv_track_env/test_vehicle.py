@@ -15,6 +15,7 @@ from lpv_track_env.bicycle import derivative, fastest_pole
 from lpv_track_env.plausibility import FASTEST_POLE, INVERSE_SPEED_AT_STANDSTILL
 from lpv_track_env.vehicle import (
     COURSE_CAR,
+    HEIGHT_SHARE,
     M2_MINIBUS,
     PARAMETER_ORDER,
     VEHICLES,
@@ -27,6 +28,7 @@ POSITIVE = (
     "mass", "yaw_inertia", "front_axle_distance", "rear_axle_distance",
     "front_cornering_stiffness", "rear_cornering_stiffness", "max_steering_angle",
     "max_steering_rate", "max_jerk", "max_lateral_velocity_ratio", "length", "width",
+    "centre_of_gravity_height",
 )  # fmt: skip
 
 
@@ -154,6 +156,20 @@ def test_json_file_is_loaded(tmp_path: Path) -> None:
         assert car.acceleration_range == (-5.0, 3.5)
 
 
+def test_height_of_the_centre_of_gravity_is_by_default_a_share_of_the_wheelbase(
+    tmp_path: Path,
+) -> None:
+    """As in files of before there was this field."""
+    values = M2_MINIBUS.as_dict()
+    del values["centre_of_gravity_height"]
+    for given in (values, {**values, "centre_of_gravity_height": None}):
+        car = vehicle.load(written(tmp_path, given))
+        assert car.centre_of_gravity_height == HEIGHT_SHARE * 3.3
+    assert M2_MINIBUS.centre_of_gravity_height == 0.9
+    with pytest.raises(ValueError, match="front_axle_distance must be positive, not 'far'"):
+        vehicle.load(written(tmp_path, {**values, "front_axle_distance": "far"}))
+
+
 def test_json_file_takes_its_name_and_defaults(tmp_path: Path) -> None:
     values = {field: getattr(M2_MINIBUS, field) for field in PARAMETER_ORDER[:-1]}
     car = vehicle.load(written(tmp_path, {**values, "rolling_resistance": 0.015}))
@@ -257,6 +273,7 @@ def test_vehicles_that_others_have_sent_are_plausible(name: str) -> None:
         ({"front_axle_distance": 1600}, "front_axle_distance 1600 m .*mm[?] 1600 mm = 1.6 m"),
         ({"rear_axle_distance": 170}, "cm[?] 170 cm = 1.7 m"),
         ({"width": 2000}, "mm[?] 2000 mm = 2 m"),
+        ({"centre_of_gravity_height": 57}, "57 m is implausible.* cm[?] 57 cm = 0.57 m"),
         ({"rolling_resistance": 2}, "%[?] 2 % = 0.02"),
         ({"speed_range": [1, 120]}, "km/h[?] 120 km/h = 33.33 m/s"),
         ({"acceleration_range": [-5000, 3500]}, "acceleration_range -5000 m/s.2 is implausible"),

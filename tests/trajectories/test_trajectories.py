@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from trajectories import PUBLISHED, ReferencePath, load, names, random_path, statistics
 from trajectories.path import SPACING
+from trajectories.speed import GRAVITY
 
 SIX = ("T1", "T2", "T3", "T4", "T5", "T6")
 # kumar2025lpv: speed (km/h), acceleration, lateral acceleration, length, curvature rows.
@@ -137,6 +138,35 @@ def test_random_paths_are_drivable(
     assert lateral.max() <= 1.005 * limits["max_lateral_acceleration"]
     assert shortest < path.length < longest
     assert path.speed.max() <= 1.005 * limits["max_speed"] <= 1.005 * fastest
+
+
+@given(seed=st.integers(0, 2**63))
+@settings(max_examples=10, deadline=None)
+def test_limit_paths_use_the_grip_of_their_seed(seed: int) -> None:
+    path = load(f"random-limit-{seed}")
+    check_contract(path, f"random-limit-{seed}")
+    assert np.abs(path.curvature).max() < STEERABLE
+    grip = 0.5 + 0.05 * (seed % 10)
+    assert path.metadata["grip"] == pytest.approx(grip, abs=1e-12)
+    lateral = (path.speed**2 * np.abs(path.curvature)).max() / GRAVITY
+    assert lateral == pytest.approx(grip, rel=0.02)
+    assert -3.0 * 1.005 <= path.acceleration.min() < path.acceleration.max() <= 2.0 * 1.005
+    assert path.speed[[0, -1]] == pytest.approx(10.0)
+
+
+def test_a_section_is_the_part_of_the_path() -> None:
+    path = load("T2")
+    part = path.section(100.0, 220.0)
+    first = round(100.0 / path.spacing)
+    nodes = slice(first, first + len(part.arc_length))
+    assert not part.closed
+    assert part.length == pytest.approx(120.0, abs=path.spacing)
+    for column in ("x", "y", "heading", "curvature", "speed"):
+        np.testing.assert_array_equal(getattr(part, column), getattr(path, column)[nodes])
+    assert path.section(0.0, path.length).table.shape == path.table.shape
+    for start, end in ((-1.0, 50.0), (50.0, 50.0), (0.0, 600.0)):
+        with pytest.raises(ValueError, match="is not within its"):
+            path.section(start, end)
 
 
 def test_random_paths_repeat_with_their_seed_and_differ_without() -> None:

@@ -13,7 +13,9 @@ from experiments.run.suites import (
     DEMONSTRATION,
     HELD_OUT,
     LEAST_SEEDS,
+    LIMIT_PATHS,
     RAW,
+    REGIMES,
     SIX,
     SUITES,
     default_agents,
@@ -23,7 +25,7 @@ from tests.helpers.learned_policies import random_policy
 from tests.helpers.policy_files import DRIVING
 
 
-@pytest.mark.parametrize("suite", SUITES)
+@pytest.mark.parametrize("suite", [name for name in SUITES if name != "limits"])
 def test_cases_of_a_suite_are_valid_and_distinct(suite: str) -> None:
     specs = SUITES[suite](default_agents(), [0, 1])
     cases = [Case(**spec) for spec in specs]
@@ -36,6 +38,22 @@ def test_cases_of_a_suite_are_valid_and_distinct(suite: str) -> None:
     other = [case for case in cases if case not in ideal]
     assert {case.seed for case in other} in (set(), set(range(LEAST_SEEDS)))
     assert len(ideal) + len(other) == len(cases)
+
+
+def test_limits_drives_every_regime_with_the_same_cases_for_each_agent() -> None:
+    names = ["stanley", "lpv-nmpc", "lpv-nmpc-ipopt"]
+    cases = [Case(**spec) for spec in SUITES["limits"](names, [0])]
+    for case in cases:
+        case.check()
+    assert len({case.id for case in cases}) == len(cases) == 2 * 108
+    assert Counter(case.agent for case in cases) == {"stanley": 108, "lpv-nmpc": 108}
+    drives = Counter(case.regime for case in cases if case.agent == "stanley")
+    assert tuple(drives) == REGIMES
+    assert list(drives.values()) == [10, 10, 20, 20, 8, 6, 4, 10, 10, 10]
+    more = Counter(spec["regime"] for spec in SUITES["limits"](["stanley"], range(3)))
+    assert list(more.values()) == [30, 30, 30, 30, 12, 6, 12, 30, 10, 30]
+    used = {case.trajectory for case in cases if case.trajectory.startswith("random-limit")}
+    assert used < set(LIMIT_PATHS)
 
 
 def test_default_agents_are_those_to_drive_with() -> None:

@@ -14,7 +14,7 @@ import trajectories
 from lpv_track_env.bicycle import VX, VY, YAW_RATE, X, Y, derivative
 from lpv_track_env.conditions import IDEAL, REALTIME, WIND_LEVER, Conditions
 from lpv_track_env.conditions import layout as conditions_layout
-from lpv_track_env.conditions.vehicle import AIR_DENSITY, secant
+from lpv_track_env.conditions.vehicle import AIR_DENSITY
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vehicle import VEHICLES
@@ -142,21 +142,6 @@ def test_other_parameters_are_the_bicycles_own() -> None:
         np.testing.assert_allclose(info["state"], state, atol=1e-7)
 
 
-def test_secant_stiffness_is_the_brush_models() -> None:
-    """Against the brush model's integral over the contact patch, parabolic pressure."""
-    stiffness, limit = 80000.0, 9000.0
-    for slip in (-0.4, -0.1, 1e-4, 0.05, 0.2, 0.33, 0.35, 1.0):
-        # Bristles along the patch, s from 0 to 1: deflection slip * s sticks up to the friction.
-        s = (np.arange(200000) + 0.5) / 200000
-        sticking = 2.0 * stiffness * abs(slip) * s
-        friction = limit * 6.0 * s * (1.0 - s)
-        # From the leading edge on (s = 0) they stick until friction is used up, then all slide.
-        slides = np.cumsum(sticking > friction) > 0
-        force = np.where(slides, friction, sticking).mean()
-        assert secant(stiffness, slip, limit) * abs(slip) == pytest.approx(force, rel=2e-4)
-    assert secant(stiffness, 0.3, math.inf) == stiffness
-
-
 def test_no_more_lateral_force_than_friction() -> None:
     env = straight(friction=0.3)
     largest = 0.0
@@ -169,6 +154,47 @@ def test_no_more_lateral_force_than_friction() -> None:
         lateral = (state[VY] - before[VY]) / PERIOD + before[YAW_RATE] * before[VX]
         largest = max(largest, abs(lateral))
     assert 0.25 * GRAVITY < largest < 0.31 * GRAVITY
+
+
+def test_braking_takes_from_the_steering() -> None:
+    """In a bend at the limit, full braking leaves less than half of the side force."""
+    friction = 0.5
+    path = trajectories.load("straight").with_speed(12.0)
+
+    def pulled(command: float) -> float:
+        """Mean lateral acceleration of some steps, after a turn and the same time under `a`."""
+        env = PathTrackingEnv(
+            path, conditions=IDEAL.replace(friction=friction), max_lateral_error=100.0
+        )
+        env.reset(seed=0)
+        for _ in range(12):
+            before = act(env, HOLD, 0.3)["state"]
+        sideways = []
+        for _ in range(24):
+            now = act(env, command, 0.3)["state"]
+            turning = 0.25 * (now[YAW_RATE] + before[YAW_RATE]) * (now[VX] + before[VX])
+            sideways.append((now[VY] - before[VY]) / PERIOD + turning)
+            before = now
+        assert before[VX] > 5.0
+        return float(np.mean(sideways[-3:]))
+
+    held, braked = pulled(HOLD), pulled(-5.0)
+    assert 0.9 * friction * GRAVITY < held <= 1.001 * friction * GRAVITY
+    assert 0.0 < braked < 0.5 * held
+
+
+def test_a_vehicle_stops_within_its_friction() -> None:
+    """From 10 m/s: at most 0.95 mu g once the brakes are applied, whatever is commanded."""
+    for friction in (0.1, 0.3):
+        env = straight(friction=friction, rolling_factor=0.0)
+        while env.state[VX] > 8.0:
+            act(env, -5.0, 0.0)
+        start = env.state
+        while env.state[VX] > 2.0:
+            act(env, -5.0, 0.0)
+        end = env.state
+        wanted = (start[VX] ** 2 - end[VX] ** 2) / (2.0 * 0.95 * friction * GRAVITY)
+        assert end[X] - start[X] == pytest.approx(wanted, rel=1e-6)
 
 
 def test_side_wind_pushes_by_its_force() -> None:
