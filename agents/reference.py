@@ -22,6 +22,12 @@ Array = NDArray[Any]
 NODE_SPEED, NODE_HEADING, NODE_X, NODE_Y, NODE_ARC_LENGTH = range(5)
 NODE = 5
 """Number of columns of a node."""
+NEAR_PATH = 0.5
+"""Lateral error, m, up to which a predictive controller heads for the path itself."""
+APPROACH_SLOPE = 0.4
+"""Largest tangent of the angle to the path at which a vehicle far from it approaches."""
+APPROACH_TIME, SHORTEST_APPROACH = 0.5, 2.0
+"""Least length over which the offset of an approach decays: time at the vehicle's speed, s; m."""
 
 
 class LocalReference(NamedTuple):
@@ -64,7 +70,11 @@ class Turn(NamedTuple):
 
 
 def local_reference(
-    observation: TrackingObservation, period: float, lengths: Array | None = None
+    observation: TrackingObservation,
+    period: float,
+    lengths: Array | None = None,
+    *,
+    approaching: bool = False,
 ) -> LocalReference:
     """Reconstruct nodes of the reference from the preview of an observation.
 
@@ -80,6 +90,8 @@ def local_reference(
         Spacing of the preview in the reference's time, s (`ObservationLayout.preview_period`).
     lengths
         Time from each node to the next, (n,) s; by default the preview's K periods.
+    approaching
+        Lead a vehicle far beside the path back to it, as `approach` does.
     """
     curvature = np.asarray(observation.preview_curvature, dtype=np.float64)
     rows = curvature.reshape(-1, curvature.shape[-1])
@@ -88,6 +100,12 @@ def local_reference(
     lengths = np.full(rows.shape[1], period) if lengths is None else lengths
     nodes = np.empty((rows.shape[0], len(lengths) + 1, NODE))
     _fill_rows(rows, first, speed, period, lengths, nodes)
+    if approaching:
+        errors, speeds = (
+            np.asarray(values, dtype=np.float64).reshape(-1)
+            for values in (observation.lateral_error, observation.longitudinal_speed)
+        )
+        _approach_rows(nodes, errors, speeds)
     shaped = nodes.reshape(*curvature.shape[:-1], len(lengths) + 1, NODE)
     return LocalReference(
         arc_length=shaped[..., NODE_ARC_LENGTH],
@@ -162,6 +180,34 @@ def fill_nodes_at(
                 at, left = at + 1, period
         nodes[k + 1, NODE_SPEED], nodes[k + 1, NODE_HEADING] = v, heading
         nodes[k + 1, NODE_X], nodes[k + 1, NODE_Y], nodes[k + 1, NODE_ARC_LENGTH] = x, y, s
+
+
+@compiled_internal
+def approach(nodes: Array, lateral_error: Any, speed: Any) -> None:
+    """Let the nodes (n + 1, NODE) lead a vehicle far beside the path back to it, in place.
+
+    An offset that decays along the path is added, with the heading that goes with it: a reference
+    trajectory in the sense of Richalet (Automatica 29, 1993). The part of the lateral error (m)
+    beyond `NEAR_PATH` decays as exp(-s / d), which a vehicle that follows it sees again at any
+    later time. The length d bounds the angle of approach, and grows with the speed (m/s).
+    """
+    excess = abs(lateral_error) - NEAR_PATH
+    if not excess > 0.0:
+        return
+    length = max(excess / APPROACH_SLOPE, APPROACH_TIME * abs(speed), SHORTEST_APPROACH)
+    start = math.copysign(excess, lateral_error)
+    for k in range(nodes.shape[0]):
+        offset = start * math.exp(-nodes[k, NODE_ARC_LENGTH] / length)
+        heading = nodes[k, NODE_HEADING]
+        nodes[k, NODE_X] -= offset * math.sin(heading)
+        nodes[k, NODE_Y] += offset * math.cos(heading)
+        nodes[k, NODE_HEADING] = heading - math.atan(offset / length)
+
+
+@compiled
+def _approach_rows(nodes: Array, lateral_error: Array, speed: Array) -> None:
+    for row in range(nodes.shape[0]):
+        approach(nodes[row], lateral_error[row], speed[row])
 
 
 @compiled

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
 
 from agents.base import DrivingTask, TrackingAgent, blind_control
 from agents.classical.geometric import Stanley
@@ -25,6 +26,10 @@ Array = NDArray[np.float64]
 Memory = TypeVar("Memory")
 
 FAILURES = Whole(0, 1_000_000_000)
+GROWTH = 1.13
+"""Factor from stage to stage: from 0.05 s on, 15 stages are 2 s, the last of them 0.27 s."""
+SHORTEST_STAGE = 0.05
+"""Length of the first stage, s, at shorter control periods."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,9 +39,10 @@ class NmpcSettings:
     Parameters
     ----------
     horizon
-        Number of stages N; by default the stages end with the observation's preview.
+        Number of stages N; by default as many as grow by about `GROWTH` each.
     stages
-        Lengths of the stages, s: one number for all, or (N,). The default is the preview's period.
+        Lengths of the stages, s: one number for all, or (N,). By default the first is as long as
+        the control period, the others grow geometrically, and the last ends with the preview.
     weights
         Fixed weights, a schedule, or the file of a schedule. Either may be given as a mapping, too:
         `{"Q": [4 numbers], "S": [4], "R": [2], "R_rate": [2]}`, or a schedule in the form of its
@@ -95,7 +101,26 @@ class Fallback:
     """Failed solves by status, and replacements by name, in this episode."""
 
 
-def stages_of(settings: NmpcSettings, layout: ObservationLayout) -> tuple[float, ...]:
+def growing_stages(first: float, total: float, count: int | None = None) -> tuple[float, ...]:
+    """Return lengths of stages, s, of which each is longer than the one before by the same factor.
+
+    Coarse stages far ahead see as far as many short ones. `first` is the length of the first stage,
+    unless `count` stages of it would reach beyond `total`, the sum of all; by default so many
+    stages that the factor is about `GROWTH`.
+    """
+    if count is None:
+        count = max(math.ceil(math.log1p(total * (GROWTH - 1.0) / first) / math.log(GROWTH)), 1)
+    if count == 1 or first * count >= total:
+        return (total / count,) * count
+    powers = np.arange(count)
+    most = (total / first) ** (1.0 / (count - 1))
+    factor = brentq(lambda q: first * float(np.sum(q**powers)) - total, 1.0, most)
+    return tuple((first * factor**powers).tolist())
+
+
+def stages_of(
+    settings: NmpcSettings, layout: ObservationLayout, control_period: float
+) -> tuple[float, ...]:
     """Return the lengths of an agent's stages, s, which the preview must cover.
 
     Raises
@@ -104,10 +129,11 @@ def stages_of(settings: NmpcSettings, layout: ObservationLayout) -> tuple[float,
         If the preview is shorter.
     """
     period, seen = layout.preview_period, layout.preview_steps * layout.preview_period
-    lengths = period if settings.stages is None else settings.stages
+    if settings.stages is None:
+        return growing_stages(max(control_period, SHORTEST_STAGE), seen, settings.horizon)
+    lengths = settings.stages
     if isinstance(lengths, float):
-        horizon = settings.horizon or max(int(seen / lengths + 1e-6), 1)
-        lengths = (lengths,) * horizon
+        lengths = (lengths,) * (settings.horizon or max(int(seen / lengths + 1e-6), 1))
     if sum(lengths) > seen * (1.0 + 1e-6):
         steps = math.ceil(sum(lengths) / period - 1e-6)
         raise ValueError(
@@ -140,7 +166,7 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
 
     def __init__(self, task: DrivingTask, settings: NmpcSettings) -> None:
         super().__init__(task)
-        stages = stages_of(settings, task.layout)
+        stages = stages_of(settings, task.layout, task.control_period)
         self.problem = NmpcProblem(
             vehicle=settings.model or task.vehicle,
             horizon=len(stages),
@@ -211,7 +237,9 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
              o.lateral_error]
         )  # fmt: skip
         last = np.array([o.acceleration, o.steering_angle]).clip(low, high)
-        nodes = local_reference(o, self.task.layout.preview_period, self.problem.periods)
+        nodes = local_reference(
+            o, self.task.layout.preview_period, self.problem.periods, approaching=True
+        )
         return state, last, np.stack([nodes.speed, nodes.heading, nodes.x, nodes.y], axis=-1)
 
     def replace(

@@ -27,7 +27,7 @@ from agents.nmpc.qp import (
     clamp,
     solve_qp,
 )
-from agents.reference import NODE, fill_nodes_at
+from agents.reference import NODE, approach, fill_nodes_at
 from lpv_track_env import observation as entry
 from trajectories.compilation import (
     compiled,
@@ -157,6 +157,10 @@ def load_observation(observation: Array, constants: Array, stages: Array) -> boo
         o[first:speeds], o[entry.REFERENCE_SPEED], o[speeds:], constants[L.PREVIEW_PERIOD],
         L.grid(constants, L.LENGTH, stages.shape[0] - 1),
         stages[:, L.REFERENCE : L.REFERENCE + NODE],
+    )  # fmt: skip
+    approach(
+        stages[:, L.REFERENCE : L.REFERENCE + NODE], o[entry.LATERAL_ERROR],
+        o[entry.LONGITUDINAL_SPEED],
     )  # fmt: skip
     return True
 
