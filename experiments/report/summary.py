@@ -125,6 +125,7 @@ def findings(cases: Sequence[Result]) -> list[Tile]:
     by_conditions: dict[str, list[Result]] = {}
     for case in own:
         words = tables.conditions_words(case.get("conditions", "simulation"))
+        words = f"{family.regime}, {words}" if family.regime else words
         by_conditions.setdefault(words, []).append(case)
     shown: list[Tile] = []
     for conditions, group in by_conditions.items():

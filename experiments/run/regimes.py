@@ -12,20 +12,20 @@ from rich.table import Table
 from rich.text import Text
 
 from agents.weight_tuning.score import SCALES
-from experiments.run import suites
-from experiments.run.tables import Result, by_label
+from experiments.run.tables import Result, by_label, ordered
 
 HEADINGS = (
-    "agent", "drives", "failed", "MLE, m", "ALE, m", "steering rate, rad/s", "jerk, m/s³", "score",
+    "agent", "drives", "failed", "MLE, m", "ALE, m", "speed error, m/s", "steering rate, rad/s",
+    "jerk, m/s³", "score",
 )  # fmt: skip
 """Headings of a regime's table: the errors and rates are means over the drives that finished."""
 NOTE = (
     "A drive fails unless it reaches the end of the path. The other columns are means over the "
-    "drives that did: largest and root mean square lateral error, root mean squares of steering "
-    "rate and jerk, and the score that weights are tuned for (lower is better). Agents that fail "
-    "more often have them over easier drives."
+    "drives that did: largest and root mean square lateral error, root mean squares of speed error, "
+    "steering rate and jerk, and the score that weights are tuned for (lower is better). Agents "
+    "that fail more often have them over easier drives, and some finish because they are slow."
 )
-DECIMALS = (3, 3, 3, 2, 2)
+DECIMALS = (3, 3, 2, 3, 2, 2)
 SCORED = ("ale", "aoe", "rms_speed_error", "steering_rate_rms", "jerk_rms")
 """Metrics whose sum, each divided by its scale, is the score (`agents.weight_tuning.score`)."""
 
@@ -37,7 +37,7 @@ class Line(NamedTuple):
     drives: int
     failed: int
     means: tuple[float | None, ...]
-    """MLE and ALE (m), rms steering rate (rad/s), rms jerk (m/s^3), score."""
+    """MLE and ALE (m), rms speed error (m/s), steering rate (rad/s) and jerk (m/s^3), score."""
 
     @property
     def cells(self) -> list[str]:
@@ -50,13 +50,12 @@ class Line(NamedTuple):
 
 
 def by_regime(cases: Iterable[Result]) -> dict[str, list[Result]]:
-    """Group the cases that have a regime, in the order of `suites.REGIMES`, others after these."""
+    """Group the cases that have a regime, in the order of `tables.ordered`."""
     groups: dict[str, list[Result]] = {}
-    for case in cases:
+    for case in ordered(cases):
         if name := str(case.get("regime") or ""):
             groups.setdefault(name, []).append(case)
-    known = {name: place for place, name in enumerate(suites.REGIMES)}
-    return dict(sorted(groups.items(), key=lambda item: (known.get(item[0], len(known)), item[0])))
+    return groups
 
 
 def lines(cases: Iterable[Result]) -> list[Line]:
@@ -68,7 +67,7 @@ def _line(label: str, cases: Sequence[Result]) -> Line:
     finished = [case["metrics"] for case in cases if case.get("end") == "finished"]
     columns = [
         [metrics.get(key) for metrics in finished]
-        for key in ("mle", "ale", "steering_rate_rms", "jerk_rms")
+        for key in ("mle", "ale", "rms_speed_error", "steering_rate_rms", "jerk_rms")
     ]
     columns.append([score(metrics) for metrics in finished])
     return Line(label, len(cases), len(cases) - len(finished), tuple(map(_mean, columns)))
@@ -97,7 +96,7 @@ def table(cases: Iterable[Result]) -> Table | None:
     )  # fmt: skip
     shown.add_column("regime", max_width=38, overflow="fold")
     for place, heading in enumerate(HEADINGS):
-        shown.add_column(heading.replace(", ", "\n"), justify="right" if place else "left")
+        shown.add_column(heading.replace(" ", "\n"), justify="right" if place else "left")
     for name, group in groups.items():
         for place, line in enumerate(found := lines(group)):
             first = Text("" if place else name, style="bold")
