@@ -21,9 +21,9 @@ HEADINGS = (
 """Headings of a regime's table: the errors and rates are means over the drives that finished."""
 NOTE = (
     "A drive fails unless it reaches the end of the path. The other columns are means over the "
-    "drives that did: largest and root mean square lateral error, root mean squares of speed error, "
-    "steering rate and jerk, and the score that weights are tuned for (lower is better). Agents "
-    "that fail more often have them over easier drives, and some finish because they are slow."
+    "drives that did: largest and root mean square lateral error, root mean squares of speed "
+    "error, steering rate and jerk, and the score that weights are tuned for (lower is better). "
+    "Agents that fail more often have them over easier drives; some finish because they are slow."
 )
 DECIMALS = (3, 3, 2, 3, 2, 2)
 SCORED = ("ale", "aoe", "rms_speed_error", "steering_rate_rms", "jerk_rms")
