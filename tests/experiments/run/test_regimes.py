@@ -68,3 +68,19 @@ def test_a_regime_is_a_setting_of_its_own_and_old_results_have_none() -> None:
     assert str(setting_of(slow)).startswith(f"{SLOW} · m2-minibus")
     # The same drive by later sources counts once, although the old result has no regime.
     assert current([old, new, slow]) == [new, slow]
+
+
+def test_cases_with_a_start_show_how_they_come_back() -> None:
+    back = {**RATES, "overshoot": 0.25, "recovery_time": 4.56}
+    away = {"arc_length": 7, "speed": 0.0}
+    cases = [case(1, regime="beside", start=away, metrics=back), case(2, regime=SLOW)]
+    groups = regimes.by_regime(cases)
+    (line,) = regimes.lines(groups["beside"])
+    assert regimes.headings(line.columns)[3:6] == ["MLE, m", "overshoot, m", "back after, s"]
+    assert line.cells[3:6] == [f"{METRICS['mle']:.3f}", "0.250", "4.6"]
+    assert regimes.columns_of(groups[SLOW]) == regimes.MEANS
+    console = Console(width=120, file=io.StringIO())
+    console.print(screen(cases)[0])
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "overshoot" in text
+    assert "4.6" in text
