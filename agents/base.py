@@ -170,11 +170,18 @@ def check_compatible(
             f"{name} acts every {control_period:g} s, this environment every "
             f"{task.control_period:g}: make the environment with {period}, or train one for it"
         )
+    check_vehicle(name, task, vehicle, stacklevel=stacklevel + 1)
+
+
+def check_vehicle(
+    name: str, task: DrivingTask, vehicle: object, *, how: str = "trained", stacklevel: int = 3
+) -> None:
+    """Warn if what has been trained or tuned for a vehicle, given by name, drives another one."""
     if isinstance(vehicle, str) and vehicle != task.vehicle.name:
         # Results hold warnings: a shipped policy is named without this installation's folder.
         shown = name.replace(f"{CHECKPOINTS}{os.sep}", "")
         warnings.warn(
-            f"{shown} was trained for vehicle {vehicle!r}, not for {task.vehicle.name!r}",
+            f"{shown} was {how} for vehicle {vehicle!r}, not for {task.vehicle.name!r}",
             UserWarning,
             stacklevel=stacklevel,
         )

@@ -102,6 +102,36 @@ def action_space(vehicles: Sequence[VehicleParameters]) -> spaces.Space[NDArray[
     return spaces.Box(low, high, dtype=np.float32)
 
 
+def check_start(
+    given: Array, path: ReferencePath, car: VehicleParameters, *, random_start: bool = False
+) -> None:
+    """Check the speed of a start that reset options give; `given` as in `episodes.begin`.
+
+    Raises
+    ------
+    ValueError
+        If it is below the vehicle's lowest speed; at a drawn arc length, even where the path is
+        fastest.
+    """
+    start, _, _, speed_error, speed = given.tolist()
+    if math.isnan(speed):
+        if not speed_error < 0.0:
+            return
+        if math.isnan(start) and random_start:
+            reference = float(path.speed.max())
+        else:
+            reference = float(path.sample(0.0 if math.isnan(start) else start).speed)
+        speed, option = reference + speed_error, f"speed_error {speed_error:g} m/s"
+    else:
+        reference, option = 0.0, f"speed {speed:g} m/s"
+    if speed < car.lowest_start - SPEED_ROUNDING:
+        raise ValueError(
+            f"reset option {option}: an episode cannot start at {speed:g} m/s, vehicle "
+            f"{shown(car.name)} drives at {car.lowest_start:g} m/s or more: give at least "
+            f"{car.lowest_start - reference:g}"
+        )
+
+
 @dataclass(frozen=True)
 class Task:
     """Settings of path tracking: the arguments of `PathTrackingEnv`, resolved."""
@@ -141,32 +171,8 @@ class Task:
             )
 
     def check_start(self, given: Array) -> None:
-        """Check the speed of a start that reset options give; `given` as in `episodes.begin`.
-
-        Raises
-        ------
-        ValueError
-            If it is below the vehicle's lowest speed, at a drawn arc length even where the path is
-            fastest.
-        """
-        start, _, _, speed_error, speed = given.tolist()
-        if math.isnan(speed):
-            if not speed_error < 0.0:
-                return
-            if math.isnan(start) and self.random_start:
-                reference = float(self.path.speed.max())
-            else:
-                reference = float(self.path.sample(0.0 if math.isnan(start) else start).speed)
-            speed, option = reference + speed_error, f"speed_error {speed_error:g} m/s"
-        else:
-            reference, option = 0.0, f"speed {speed:g} m/s"
-        lowest = self.vehicle.lowest_start
-        if speed < lowest - SPEED_ROUNDING:
-            raise ValueError(
-                f"reset option {option}: an episode cannot start at {speed:g} m/s, vehicle "
-                f"{shown(self.vehicle.name)} drives at {lowest:g} m/s or more: give at least "
-                f"{lowest - reference:g}"
-            )
+        """Check the speed of a start that reset options give, as the function `check_start`."""
+        check_start(given, self.path, self.vehicle, random_start=self.random_start)
 
     @property
     def substeps(self) -> int:

@@ -269,6 +269,11 @@ def checked_threads(value: int) -> int:
     return threads
 
 
+def checked_start(start: Any, length: float) -> NDArray[np.float64]:
+    """Return what `given_start` does for a start alone, without options of other kinds."""
+    return given_start(checked_options(start, GIVEN), length)
+
+
 def given_start(options: Mapping[str, Any], length: float) -> NDArray[np.float64]:
     """Return the start that reset options give, (5,) in the order of `GIVEN`; NaN is drawn.
 

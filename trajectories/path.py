@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trajectories import projection, table
-from trajectories.arguments import Whole, array, flag, instance_of, shown
+from trajectories.arguments import Number, Whole, array, flag, instance_of, shown
 
 SPACING = 0.25
 """m between nodes of every path, up to fitting its length exactly."""
@@ -18,6 +18,8 @@ MINIMUM_SPEED = 0.05
 """m/s; a slower reference would take too long to arrive."""
 COUNTS = Whole(0, 100_000)
 """Rule of the number of entries of a preview."""
+ARC_LENGTHS = Number(unit="m")
+"""Rule of an arc length."""
 SEAM_GAP = 2e-3
 """Largest gap between the ends of a closed path, in m and, for the heading, in turns."""
 
@@ -260,7 +262,7 @@ class ReferencePath:
         ValueError
             If it is not within the path, or has fewer than 4 nodes.
         """
-        _finite("section", (start, end))
+        start, end = (ARC_LENGTHS.of("section", value) for value in (start, end))
         if not 0.0 <= start < end <= self.length + 0.5 * self.spacing:
             raise ValueError(
                 f"path {shown(self.name)}: section {start:g} to {end:g} m is not within its "

@@ -14,6 +14,7 @@ from agents.base import (
     Action,
     DrivingTask,
     check_compatible,
+    check_vehicle,
     checked_task,
 )
 from agents.delay import NearFuture, moved_plan
@@ -85,6 +86,12 @@ class TunedNmpc:
         self.task = checked_task(task)
         self.weights = _loaded(weights)
         policy = self.weights if isinstance(self.weights, WeightPolicy) else None
+        if isinstance(self.weights, WeightSchedule):
+            file = f" {weights}" if isinstance(weights, str | Path) else ""
+            check_vehicle(
+                f"schedule of weights{file}", task, self.weights.provenance.get("vehicle"),
+                how="tuned", stacklevel=4,
+            )  # fmt: skip
         if policy is not None:
             named = weights if isinstance(weights, str | Path) else repr(policy.algorithm)
             check_compatible(

@@ -19,8 +19,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--suite",
         default="paper",
-        help="paper (default), quick, realtime, learned, plants, limits, converged, sideslip or "
-        "frozen",
+        help="paper (default), quick, realtime, learned, plants, limits, recovery, converged, "
+        "sideslip or frozen",
     )
     shared.add_agents(parser, "default: all; your own: file.py:Class, policy.json")
     shared.add_trajectories(parser, None, "instead of a suite's: names or files")
@@ -36,6 +36,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shared.add_control_period(parser)
     shared.add_settings(
         parser, "--env", "environment settings, e.g. initial_error_range=[0.3,0.1,0.5]"
+    )
+    shared.add_settings(
+        parser, "--start", "where the vehicle starts, e.g. arc_length=40 lateral_error=2 speed=0"
     )
     shared.add_agent_settings(parser)
     shared.add_settings(
@@ -77,6 +80,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     common = {
         "env_settings": shared.parse_settings(options.env),
         "vehicle_changes": shared.parse_settings(options.vehicle_set),
+        "start": shared.parse_settings(options.start),
     }
     if options.control_period is not None:
         common["control_period"] = options.control_period

@@ -74,7 +74,6 @@ def regime_section(document: Document, cases: Sequence[Result]) -> str:
         return ""
     labels = tables.labels(case for case in cases if case.get("regime"))
     overview = [[name, *_overview(found, labels)] for name, found in groups.items()]
-    numeric = range(1, len(regimes.HEADINGS))
     return joined(
         [
             paragraph(regimes.NOTE),
@@ -85,7 +84,11 @@ def regime_section(document: Document, cases: Sequence[Result]) -> str:
             *(
                 document.table(
                     f"Every agent, {name}.",
-                    html_table(regimes.HEADINGS, [line.cells for line in found], numeric),
+                    html_table(
+                        regimes.headings(found[0].columns),
+                        [line.cells for line in found],
+                        range(1, len(found[0].cells)),
+                    ),
                 )
                 for name, found in groups.items()
             ),
@@ -125,6 +128,7 @@ def findings(cases: Sequence[Result]) -> list[Tile]:
     by_conditions: dict[str, list[Result]] = {}
     for case in own:
         words = tables.conditions_words(case.get("conditions", "simulation"))
+        words = f"{family.regime}, {words}" if family.regime else words
         by_conditions.setdefault(words, []).append(case)
     shown: list[Tile] = []
     for conditions, group in by_conditions.items():

@@ -37,7 +37,8 @@ from experiments.run.rollout import Rollout, rollout
 from lpv_track_env import conditions, plants, vehicle
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.reward import RewardWeights
-from lpv_track_env.task import SPEED_MODES
+from lpv_track_env.task import SPEED_MODES, check_start, reference
+from lpv_track_env.validation import checked_start
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.arguments import instance_of, shortened
 from trajectories.compilation import source_digest
@@ -154,7 +155,8 @@ class Case(BaseCase):
     `vehicle_changes` replaces fields of the vehicle, for the plant and the agents' models alike
     (say, a wider `max_lateral_velocity_ratio`); `agent_settings` and `env_settings` are keyword
     arguments of the agent's class and of the environment. `regime` names what a case is meant to
-    try, such as "slow actuators": tables put the cases of a regime together.
+    try, such as "slow actuators": tables put the cases of a regime together. `start` holds reset
+    options that say where the vehicle starts: any of `lpv_track_env.episodes.GIVEN`.
     """
 
     agent: str
@@ -170,6 +172,7 @@ class Case(BaseCase):
     env_settings: Mapping[str, Any] = field(default_factory=dict)
     computing: Mapping[str, Any] = field(default_factory=dict)
     regime: str = ""
+    start: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def place(self) -> str:
@@ -204,7 +207,11 @@ class Case(BaseCase):
         self.resolved_env_settings()
         for key in self.vehicle_changes:
             choose("vehicle field", key, VEHICLE_FIELDS)
-        plants.make(self.env_settings.get("plant", plants.BICYCLE), self.make_vehicle())
+        car = self.make_vehicle()
+        plants.make(self.env_settings.get("plant", plants.BICYCLE), car)
+        if self.start:
+            path = reference(self.trajectory, car, self.speed_mode, self.fixed_speed)
+            check_start(checked_start(self.start, path.length), path, car)
 
     def packages(self) -> tuple[str, ...]:
         """Return the packages that compute a result."""
@@ -265,7 +272,9 @@ class Case(BaseCase):
             computing = self.make_computing()
             agent = self.make_agent(env)
             result |= learning_cost.of_agent(agent)
-            driven = rollout(env, agent, seed=self.seed, computing_time=computing)
+            driven = rollout(
+                env, agent, seed=self.seed, options=dict(self.start), computing_time=computing
+            )
             car = env.unwrapped.vehicle  # type: ignore[attr-defined]
             env.close()
         for warning in caught:

@@ -74,12 +74,14 @@ def compare(first: Path, second: Path) -> Comparison:
 
 
 def _by_spec(folder: Path) -> dict[str, Result]:
-    """Results by what was driven, as JSON text."""
+    """Results by what was driven, as JSON text; an empty entry is the same as none."""
     cases = ResultStore(folder).cases() if folder.is_dir() else []
     if not cases:
         raise ValueError(f"no results in {folder}")
     return {
-        json.dumps({key: case[key] for key in sorted(case) if key not in OUTCOMES}): case
+        json.dumps(
+            {key: case[key] for key in sorted(case) if key not in OUTCOMES and case[key]}
+        ): case
         for case in cases
     }
 

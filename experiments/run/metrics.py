@@ -27,6 +27,9 @@ Array = NDArray[np.float64]
 
 BANDS = CurvatureBands()
 """Straight, gentle, moderate, sharp."""
+RECOVERED, NEAR, AHEAD = 0.1, 0.05, 1e-3
+"""Lateral errors (m) of a vehicle that has come back to the path and of a start on it, and heading
+error (rad) of a start along it."""
 KEPT = 1e-3
 """Largest excess, in a constraint's unit, that does not count as a violation."""
 
@@ -183,12 +186,34 @@ def knowledge(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> 
     }
 
 
+def recovery(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
+    """Compute how the vehicle comes to the path from where it starts.
+
+    `overshoot` is the largest lateral error (m) on the other side of the path than the start: 0 if
+    there is none. The side is that of the lateral error, within `NEAR` of the path that to which
+    the heading error leads; a start without either counts both sides. `recovery_time` is the time
+    (s) from which on the lateral error stays below `RECOVERED`; there is none if it never does.
+    """
+    del path, vehicle
+    error = trace.lateral_error
+    away = error[0] if abs(error[0]) > NEAR else trace.heading_error[0]
+    other = np.abs(error) if abs(away) <= AHEAD else -np.sign(away) * error
+    result = {"overshoot": float(max(other.max(), 0.0))}
+    beyond = np.flatnonzero(np.abs(error) >= RECOVERED)
+    if beyond.size == 0:
+        result["recovery_time"] = 0.0
+    elif beyond[-1] + 1 < error.size:
+        result["recovery_time"] = float(trace.time[beyond[-1] + 1])
+    return result
+
+
 METRICS: tuple[Callable[[Trace, ReferencePath, VehicleParameters], dict[str, float]], ...] = (
     tracking,
     by_band,
     activity,
     violations,
     knowledge,
+    recovery,
 )
 """Functions whose entries form a case's `metrics`; add your own here."""
 

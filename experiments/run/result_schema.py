@@ -79,6 +79,7 @@ class Stored(TypedDict, total=False):
     env_settings: Settings
     computing: Computing | None
     regime: Name
+    start: Settings
     end: Name | None
     error: Text | None
     seconds: Time

@@ -1,5 +1,6 @@
 """Suites: named lists of cases."""
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -96,7 +97,39 @@ LIMITS: dict[str, list[dict[str, Any]]] = {
 Friction 0.79 at 0.75 g of lateral acceleration is 95 % of the grip. At 0.55 g, a draw of the
 friction below 0.55 cannot be held by anybody.
 """
-REGIMES = tuple(LIMITS)
+STANDING = tuple(
+    (name, arc_length)
+    for name, last in (
+        ("T1", 729), ("T2", 463), ("T3", 995), ("T4", 463), ("T5", 2097), ("T6", 1907),
+        ("u-turn", 83),
+    )
+    for arc_length in range(7, last + 1, 38)
+)  # fmt: skip
+"""The 183 standing starts of `recovery`, m: every 38 m, and 18 m or more before the end."""
+BESIDE_PATHS = {"straight": 0, "circle": 0, "T3": 740}
+"""Paths of the starts of `recovery` beside the path, and where; 30 m before a bend on T3."""
+OFFSETS = (-4.5, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.5)
+"""m."""
+DEGREES = (-80, -60, -40, -20, 0, 20, 40, 60, 80)
+RECOVERY: dict[str, list[tuple[str, dict[str, float]]]] = {
+    "standing starts": [(name, {"arc_length": s, "speed": 0.0}) for name, s in STANDING],
+    **{
+        f"beside {name}, {s} m": [
+            (
+                name,
+                {
+                    "arc_length": s, "lateral_error": offset,
+                    "heading_error": round(math.radians(angle), 6),
+                },
+            )
+            for offset in OFFSETS
+            for angle in DEGREES
+        ]
+        for name, s in BESIDE_PATHS.items()
+    },
+}  # fmt: skip
+"""Regimes of the suite `recovery`: paths and starts."""
+REGIMES = (*LIMITS, *RECOVERY)
 """Names of all regimes, in the order of tables."""
 
 
@@ -228,6 +261,17 @@ def limits(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
     return specs
 
 
+def recovery(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
+    """The starts of `RECOVERY` with every agent that does not solve to convergence."""
+    _, fast = _by_speed(agent_names)
+    return [
+        spec
+        for regime, starts in RECOVERY.items()
+        for name, start in starts
+        for spec in grid(fast, (name,), seeds=seeds, regime=regime, start=start)
+    ]
+
+
 def _several(seeds: Sequence[int]) -> Sequence[int]:
     return seeds if len(seeds) >= LEAST_SEEDS else range(LEAST_SEEDS)
 
@@ -262,6 +306,7 @@ SUITES = {
     "frozen": frozen,
     "plants": independent,
     "limits": limits,
+    "recovery": recovery,
 }
 
 

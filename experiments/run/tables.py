@@ -18,6 +18,7 @@ from scipy.stats import t as student
 
 import agents
 import trajectories
+from experiments.run import suites
 from experiments.run.case import Case
 from experiments.run.learning_cost import words
 from experiments.run.metrics import KEPT, PAPER_COLUMNS, published_row
@@ -282,12 +283,14 @@ def _rank(known: Sequence[str]) -> Callable[[str], tuple[int, str]]:
 
 
 def ordered(cases: Iterable[Result]) -> list[Result]:
-    """Sort cases by setting, trajectory, agent and seed."""
+    """Sort cases by regime, setting, trajectory, agent and seed."""
+    regime = _rank(("", *suites.REGIMES))
     path, agent = _rank(trajectories.names()), _rank(agents.names())
     return sorted(
         cases,
         key=lambda case: (
-            (setting := setting_of(case)).departures,
+            regime((setting := setting_of(case)).regime),
+            setting.departures,
             str(setting),
             path(str(case.get("trajectory"))),
             agent(str(case.get("agent"))),

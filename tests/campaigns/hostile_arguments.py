@@ -340,6 +340,7 @@ TARGETS: tuple[Target, ...] = (
         "max_acceleration": _some(1.5),
     }),
     Target("trajectories:random_path", {}),
+    Target("trajectories.random_paths:limit_path", {}),
     Target("trajectories:load", {}),
     Target("trajectories:CurvatureBands", {}),
     Target("agents.weights:TrackingWeights", {}),

@@ -24,6 +24,7 @@ from agents.weight_tuning.loop_kernels import take_in
 from agents.weight_tuning.policy import WeightPolicy
 from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
 from experiments.run import case as cases
+from experiments.run.case import run_case
 from lpv_track_env import kernels
 from lpv_track_env.conditions import REALTIME
 from lpv_track_env.env import PathTrackingEnv
@@ -330,6 +331,26 @@ def test_a_policy_for_another_vehicle_is_warned_of() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         agents.make(NAME, PathTrackingEnv("T2", vehicle="course-car"), weights=policy)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({}, "schedule of weights search was tuned for vehicle 'm2-minibus', not for 'bmw-320i'"),
+        (
+            {"weights": "paired"},
+            "policy of weights paired was trained for vehicle 'm2-minibus', not for 'bmw-320i'",
+        ),
+    ],
+    ids=["fixed set", "policy"],
+)
+def test_shipped_weights_on_another_vehicle_are_told_in_the_result(
+    settings: dict[str, str], said: str
+) -> None:
+    spec = {"agent": NAME, "trajectory": "u-turn", "agent_settings": settings,
+            "env_settings": {"time_limit": 1.0}}  # fmt: skip
+    assert run_case({**spec, "vehicle": "bmw-320i"})["warnings"] == [said]
+    assert run_case(spec)["warnings"] == []
 
 
 def test_files_of_weights(tmp_path: Path) -> None:

@@ -26,6 +26,14 @@ def test_equal_results_have_no_difference(
     assert "stanley 2.000 -> 2.500 ms" in said
 
 
+def test_entries_that_an_old_result_lacks_are_empty(tmp_path: Path) -> None:
+    folder_of(tmp_path / "a", [case(1)], traces=False)
+    folder_of(tmp_path / "b", [case(2, regime="", computing={})], traces=False)
+    assert compare(tmp_path / "a", tmp_path / "b").paired == 1
+    folder_of(tmp_path / "c", [case(2, regime="slow actuators")], traces=False)
+    assert compare(tmp_path / "a", tmp_path / "c").paired == 0
+
+
 def test_the_last_digit_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder_of(tmp_path / "a", [case(1), case(2, seed=1)], traces=False)
     changed = case(1, metrics={"ale": 0.08 + 2**-53}, end="left")

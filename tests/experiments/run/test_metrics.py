@@ -274,3 +274,30 @@ def test_what_was_known_is_measured_against_what_was():
     assert values["deadline_misses"] == 7.0
     ideal = metrics.evaluate(trace, straight(), CAR)
     assert ideal["rms_estimate_error"] == ideal["stopping_share"] == ideal["deadline_misses"] == 0.0
+
+
+def recovered(lateral, heading=0.0):
+    values = np.asarray(lateral, dtype=float)
+    trace = drive(len(values), lateral=values, heading=heading)
+    return metrics.recovery(trace, straight(), CAR)
+
+
+def test_recovery_counts_the_other_side_and_the_time_until_it_lasts():
+    found = recovered([2.0, 1.0, 0.05, -0.3, -0.2, 0.05, 0.02])
+    assert found == {"overshoot": 0.3, "recovery_time": pytest.approx(0.5)}
+    mirrored = recovered([-2.0, -1.0, -0.05, 0.3, 0.2, -0.05, -0.02])
+    assert mirrored == {"overshoot": 0.3, "recovery_time": pytest.approx(0.5)}
+    # Further out on its own side is no overshoot.
+    assert recovered([2.0, 3.0, 1.0, 0.0])["overshoot"] == 0.0
+    # It never comes back for good.
+    assert recovered([2.0, 0.0, -0.1]) == {"overshoot": 0.1}
+
+
+def test_recovery_from_a_start_on_the_path():
+    # It leaves to the side of its heading: what lies on the other is overshoot.
+    turned = np.array([0.5, 0.0, 0.0, 0.0])
+    assert recovered([0.0, 0.8, -0.2, 0.0], turned)["overshoot"] == 0.2
+    assert recovered([0.0, -0.8, 0.2, 0.0], -turned)["overshoot"] == 0.2
+    # With no side of its own every error counts.
+    assert recovered([0.0, 0.8, -0.2, 0.0])["overshoot"] == 0.8
+    assert recovered([0.0, 0.05, -0.02]) == {"overshoot": 0.05, "recovery_time": 0.0}

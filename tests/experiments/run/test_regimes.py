@@ -36,11 +36,11 @@ def test_lines_count_failures_and_average_what_finished() -> None:
     assert (nmpc.label, nmpc.drives, nmpc.failed, set(nmpc.means)) == ("lpv-nmpc", 1, 1, {None})
     assert (stanley.label, stanley.drives, stanley.failed) == ("stanley", 4, 2)
     # 0.08 m / 0.05 m + 0.03 / 0.1 rad + 0.25 / 0.5 m/s + 0.1 / 0.2 rad/s + 2 / 4 m/s^3
-    assert stanley.means == pytest.approx((0.4, 0.08, 0.1, 2.0, 3.4))
-    assert stanley.cells == ["stanley", "4", "2", "0.400", "0.080", "0.100", "2.00", "3.40"]
+    assert stanley.means == pytest.approx((0.4, 0.08, 0.25, 0.1, 2.0, 3.4))
+    assert stanley.cells == ["stanley", "4", "2", "0.400", "0.080", "0.25", "0.100", "2.00", "3.40"]
     # An old result lacks speed errors and rates.
     (old,) = regimes.lines(groups[DRIFT])
-    assert old.means == (METRICS["mle"], METRICS["ale"], None, None, None)
+    assert old.means == (METRICS["mle"], METRICS["ale"], None, None, None, None)
 
 
 def test_regimes_come_first_on_the_terminal_and_in_the_report(tmp_path: Path) -> None:
@@ -51,7 +51,7 @@ def test_regimes_come_first_on_the_terminal_and_in_the_report(tmp_path: Path) ->
     assert not complete
     assert text.index(DRIFT) < text.index(SLOW) < text.index("of one's own")
     row = next(line for line in text.splitlines() if "3.40" in line)
-    assert row.split()[-7:] == ["4", "2", "0.400", "0.080", "0.100", "2.00", "3.40"]
+    assert row.split()[-8:] == ["4", "2", "0.400", "0.080", "0.25", "0.100", "2.00", "3.40"]
     assert regimes.table([case(8)]) is None
     folder_of(tmp_path / "with", made())
     shown = page(tmp_path / "with")
@@ -68,3 +68,19 @@ def test_a_regime_is_a_setting_of_its_own_and_old_results_have_none() -> None:
     assert str(setting_of(slow)).startswith(f"{SLOW} · m2-minibus")
     # The same drive by later sources counts once, although the old result has no regime.
     assert current([old, new, slow]) == [new, slow]
+
+
+def test_cases_with_a_start_show_how_they_come_back() -> None:
+    back = {**RATES, "overshoot": 0.25, "recovery_time": 4.56}
+    away = {"arc_length": 7, "speed": 0.0}
+    cases = [case(1, regime="beside", start=away, metrics=back), case(2, regime=SLOW)]
+    groups = regimes.by_regime(cases)
+    (line,) = regimes.lines(groups["beside"])
+    assert regimes.headings(line.columns)[3:6] == ["MLE, m", "overshoot, m", "back after, s"]
+    assert line.cells[3:6] == [f"{METRICS['mle']:.3f}", "0.250", "4.6"]
+    assert regimes.columns_of(groups[SLOW]) == regimes.MEANS
+    console = Console(width=120, file=io.StringIO())
+    console.print(screen(cases)[0])
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "overshoot" in text
+    assert "4.6" in text

@@ -135,6 +135,7 @@ def test_settings_reach_the_agent_the_vehicle_and_the_environment():
         ({"agent_settings": {"gian": 1.0}}, "gian"),
         ({"vehicle_changes": {"mass": -1.0}}, "mass"),
         ({"env_settings": {"max_error": 1.0}}, "max_error"),
+        ({"start": {"speed": -1.0}}, "start at -1 m/s"),
     ],
 )
 def test_a_case_that_cannot_be_run_is_a_failed_result_with_its_error(change, message):
@@ -144,6 +145,37 @@ def test_a_case_that_cannot_be_run_is_a_failed_result_with_its_error(change, mes
     assert result["end"] is None
     assert result["metrics"] == result["solver"] == result["trace"] == {}
     json.dumps(result, allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [
+        ({"arc": 3.0}, r"unknown reset option 'arc'; .*nearest: arc_length"),
+        ({"trajectory": "T1"}, "unknown reset option 'trajectory'"),
+        ({"arc_length": 1e4}, "arc_length must be >= 0 and at most 117"),
+        ({"speed_error": -9.0}, "start at -6 m/s, vehicle 'm2-minibus' .* give at least -3"),
+        ({"speed": 0.0, "speed_error": 0.0}, "give one of them"),
+        ({"lateral_error": "left"}, "lateral_error must be in"),
+        ("here", "options must be a dictionary"),
+    ],
+)
+def test_a_start_is_checked_before_anything_is_driven(start, message):
+    with pytest.raises(ValueError, match=message):
+        Case(agent="stanley", trajectory="u-turn", start=start).check()
+
+
+def test_a_case_starts_where_it_says():
+    start = {"arc_length": 45.0, "lateral_error": 1.0, "heading_error": 0.1, "speed": 0.0}
+    spec = {"agent": "stanley", "trajectory": "u-turn"}
+    Case(**spec, start=start).check()
+    result = run_case({**spec, "start": start})
+    assert (result["status"], result["end"], result["start"]) == ("ok", "finished", start)
+    trace = result["trace"]
+    assert trace["state"][0, :2] == pytest.approx([0.0, 0.0])
+    assert trace["arc_length"][0] == pytest.approx(45.0, abs=1e-6)
+    assert trace["lateral_error"][0] == pytest.approx(1.0)
+    assert trace["heading_error"][0] == pytest.approx(0.1)
+    assert Case(**spec, start=start).id != Case(**spec).id
 
 
 class Recorder(TrackingAgent):

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import agents
+import trajectories
 from experiments.jobs.job import TRAINING_PATHS, VALIDATION_PATHS
 from experiments.run.case import Case
 from experiments.run.suites import (
@@ -14,6 +15,7 @@ from experiments.run.suites import (
     HELD_OUT,
     LEAST_SEEDS,
     LIMIT_PATHS,
+    LIMITS,
     RAW,
     REGIMES,
     SIX,
@@ -25,7 +27,7 @@ from tests.helpers.learned_policies import random_policy
 from tests.helpers.policy_files import DRIVING
 
 
-@pytest.mark.parametrize("suite", [name for name in SUITES if name != "limits"])
+@pytest.mark.parametrize("suite", [one for one in SUITES if one not in ("limits", "recovery")])
 def test_cases_of_a_suite_are_valid_and_distinct(suite: str) -> None:
     specs = SUITES[suite](default_agents(), [0, 1])
     cases = [Case(**spec) for spec in specs]
@@ -48,12 +50,28 @@ def test_limits_drives_every_regime_with_the_same_cases_for_each_agent() -> None
     assert len({case.id for case in cases}) == len(cases) == 2 * 108
     assert Counter(case.agent for case in cases) == {"stanley": 108, "lpv-nmpc": 108}
     drives = Counter(case.regime for case in cases if case.agent == "stanley")
-    assert tuple(drives) == REGIMES
+    assert tuple(drives) == tuple(LIMITS)
     assert list(drives.values()) == [10, 10, 20, 20, 8, 6, 4, 10, 10, 10]
     more = Counter(spec["regime"] for spec in SUITES["limits"](["stanley"], range(3)))
     assert list(more.values()) == [30, 30, 30, 30, 12, 6, 12, 30, 10, 30]
     used = {case.trajectory for case in cases if case.trajectory.startswith("random-limit")}
     assert used < set(LIMIT_PATHS)
+
+
+def test_recovery_drives_from_the_same_starts_with_each_agent() -> None:
+    cases = [Case(**spec) for spec in SUITES["recovery"](["stanley", "lpv-nmpc-ipopt", "pid"], [0])]
+    assert Counter(case.agent for case in cases) == {"stanley": 426, "pid": 426}
+    for case in cases[::20]:
+        case.check()
+    assert len({case.id for case in cases}) == len(cases)
+    starts = Counter(case.regime for case in cases if case.agent == "pid")
+    assert list(starts.values()) == [183, 81, 81, 81]
+    standing = [case for case in cases if case.regime == "standing starts"]
+    assert {case.start["speed"] for case in standing} == {0.0}
+    for name in ("T1", "T2", "T3", "T4", "T5", "T6", "u-turn"):
+        arcs = [case.start["arc_length"] for case in standing if case.trajectory == name]
+        assert 18.0 <= trajectories.load(name).length - max(arcs) < 18.0 + 38.0
+    assert (*LIMITS, *starts) == REGIMES
 
 
 def test_default_agents_are_those_to_drive_with() -> None:
