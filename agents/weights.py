@@ -48,7 +48,7 @@ class TrackingWeights:
     Q: tuple[float, float, float, float] = (1.0, 1.0, 10.0, 10.0)
     S: tuple[float, float, float, float] = (5.0, 5.0, 50.0, 50.0)
     R: tuple[float, float] = (0.01, 1.0)
-    R_rate: tuple[float, float] = (0.001, 0.1)
+    R_rate: tuple[float, float] = (0.001, 0.06)
 
     def __post_init__(self) -> None:
         for name, size in (("Q", 4), ("S", 4), ("R", 2), ("R_rate", 2)):
