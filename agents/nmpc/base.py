@@ -175,6 +175,7 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
             linear_penalty=settings.linear_penalty,
             quadratic_penalty=settings.quadratic_penalty,
         )
+        self.preview_steps = self.problem.preview_steps(task.layout.preview_period)
         self.max_failures = settings.max_failures
         self._stanley = Stanley(task)
         self.rejected_weights = 0

@@ -239,7 +239,7 @@ class ClosedLoop:
         loops.take_in_rows(
             mask, self.envs.arrays.observations, memory.arrays,
             memory.weights(memory.tables, self._rules), memory.nmpc.actions, self._work.nodes[0],
-            self.agent.problem.horizon, self.envs.single.control_period,
+            self.agent.preview_steps, self.envs.single.control_period,
         )  # fmt: skip
 
     def _drive_rows(self, arguments: tuple[Any, ...]) -> None:

@@ -68,7 +68,7 @@ def test_weights_as_mappings_are_the_weights_themselves(name: str) -> None:
         ({"Q": [1, 1, 20]}, "weights: Q must be 4 numbers, each >= 0"),
         ({"S": [1, 1, 20, -1]}, r"weights: S\[3\] must be >= 0 and finite, not -1"),
         ({"R": [0.01, "heavy"]}, r"weights: R\[1\] must be >= 0 and finite, not 'heavy'"),
-        ({"P": [1, 1, 1, 1]}, r"unknown matrix of weights 'P'; known: Q, S, R \(nearest: "),
+        ({"P": [1, 1, 1, 1]}, r"unknown matrix of weights 'P'; known: Q, S, R, R_rate \(nearest: "),
         ({**SCHEDULE.as_dict(), "weights": []}, "weights: 2 bands need as many sets, not 0"),
     ],
     ids=str,

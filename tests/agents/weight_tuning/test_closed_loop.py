@@ -289,7 +289,7 @@ def test_copies_drive_as_their_originals() -> None:
     assert {1, 4, 5} <= set(loop.memory.nmpc.fallbacks)
     loop.copy([0], [2])
     _, trace = traced(
-        loop, 10, np.array([WEIGHTS, WEIGHTS, 3.0 ** np.arange(10) * WEIGHTS, *weights[3:]])
+        loop, 10, np.array([WEIGHTS, WEIGHTS, 3.0 ** np.arange(12) * WEIGHTS, *weights[3:]])
     )
     assert not np.array_equal(trace[2], trace[0])
 
