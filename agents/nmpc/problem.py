@@ -146,7 +146,7 @@ class NmpcProblem:
 
     def preview_steps(self, period: float) -> int:
         """Return how many intervals of a preview, each of `period` s, the stages reach into."""
-        return math.ceil(self.times[-1] / period - 1e-6)
+        return math.ceil(float(self.times[-1]) / period - 1e-6)
 
     @property
     def substeps(self) -> NDArray[np.int64]:

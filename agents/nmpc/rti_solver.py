@@ -49,14 +49,14 @@ def roll_out_cost(
 ) -> Float:
     """Roll the inputs in the stages' STEP out, fill the slacks, and return the exact cost."""
     p, n = constants, lanes.shape[1]
-    lengths, most = L.grid(p, L.LENGTH, n), L.grid(p, L.SUBSTEPS, n)
+    lengths, grids = L.grid(p, L.LENGTH, n), L.grid(p, L.SUBSTEPS, n)
     for k in range(2, L.POINT):
         stages[0, L.STEP_A + k] = stages[0, L.PLAN_A + k]
     for i in range(n):
         e, end = stages[i], stages[i + 1]
         a, delta = e[L.STEP_A], e[L.STEP_DELTA]
         following = linearisation.advance(
-            linearisation.taken(e, L.STEP_VX), a, delta, lengths[i], most[i], p
+            linearisation.taken(e, L.STEP_VX), a, delta, lengths[i], grids[i], p
         )
         for k in range(6):
             end[L.STEP_VX + k] = following[k]

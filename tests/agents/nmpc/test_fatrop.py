@@ -22,9 +22,9 @@ pytestmark = pytest.mark.skipif(
 
 
 def problem(vehicle: VehicleParameters) -> NmpcProblem:
-    # Unequal first period and penalties: no entry can stand in for another.
+    # Unequal stages and penalties: no entry can stand in for another.
     return NmpcProblem(
-        vehicle, horizon=12, first_period=0.03, period=0.05,
+        vehicle, horizon=12, first_period=0.03, stages=tuple(np.linspace(0.04, 0.09, 12)),
         linear_penalty=(20.0, 15.0, 25.0), quadratic_penalty=(100.0, 80.0, 120.0),
     )  # fmt: skip
 
@@ -42,10 +42,10 @@ def situation(rng: np.random.Generator, vehicle: VehicleParameters) -> tuple[Arr
     state[5] += rng.normal(0, 0.3)
     # A command in force that no bound on the change lets go of in time breaks that on vx'.
     last = np.array([rng.uniform(-2.0, 3.0), vehicle.wheelbase * curvature])
-    s = speed * 0.05 * np.arange(13)
+    s = speed * problem(vehicle).times
     heading = curvature * s
     x, y = np.sin(heading) / curvature, (1 - np.cos(heading)) / curvature
-    weights = WEIGHTS * np.exp(rng.uniform(-1, 1, 10))
+    weights = WEIGHTS * np.exp(rng.uniform(-1, 1, 12))
     return state, last, np.column_stack([np.full(13, speed), heading, x, y]), weights
 
 

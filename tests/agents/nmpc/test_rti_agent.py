@@ -7,6 +7,7 @@ import numba
 import numpy as np
 import pytest
 
+import agents
 from agents.nmpc import rti
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import PREVIEW_START
@@ -250,10 +251,10 @@ def test_schedule_by_band_chooses_for_every_row() -> None:
 
 
 def test_control_period_shorter_than_the_previews() -> None:
-    """It plans on periods of 0.1 s, acts every 0.05 s, and moves its plan on by halves."""
+    """It plans on stages of 0.1 s, acts every 0.05 s, and moves its plan on by halves."""
     env = environment(control_period=0.05, preview_period=0.1, preview_steps=15)
     agent = made(env)
-    assert agent.problem.period == 0.1
+    np.testing.assert_array_equal(agent.problem.periods, [0.1] * 15)
     np.testing.assert_allclose(
         agent.problem.input_steps[:2, 0], agent.problem.vehicle.max_jerk * np.array([0.05, 0.1])
     )
@@ -269,7 +270,7 @@ def test_control_period_shorter_than_the_previews() -> None:
     assert info["end"] == "finished"
     assert max(lateral) < 0.05
     assert clipped == 0
-    # Blind, it follows its last plan: each of its periods lasts two steps.
+    # Blind, it follows its last plan: each of its stages lasts two steps.
     env.reset(options={"arc_length": 40.0})
     observation, _ = env.reset(options={"arc_length": 40.0, "lateral_error": 0.3})
     _, memory = agent.predict(observation, None, BEGIN)
@@ -277,6 +278,71 @@ def test_control_period_shorter_than_the_previews() -> None:
     lost[5] = np.nan
     followed = [agent.predict(lost)[0] for _ in range(4)]
     np.testing.assert_allclose(followed, plan[[0, 1, 1, 2]], rtol=1e-6)
+
+
+UNEVEN = (0.03, 0.05, 0.05, *[0.1] * 5, 0.2, 0.3, 0.4)
+"""Stages of 1.53 s, s."""
+
+
+def test_stages_of_any_length() -> None:
+    """Eleven stages drive as twenty do; a lost observation's action is that of its time."""
+    env = environment()
+    agent = made(env, stages=UNEVEN)
+    observation, info = env.reset(seed=0)
+    lateral, done = [], False
+    while not done:
+        action, memory = agent.predict(observation)
+        assert agent.diagnostics(memory[0])["status"] == "SUCCESS"
+        assert agent.diagnostics(memory[0])["plan"].shape == (12, 2)
+        observation, _, terminated, truncated, info = env.step(action)
+        lateral.append(abs(info["lateral_error"]))
+        done = terminated or truncated
+    assert info["end"] == "finished"
+    assert max(lateral) < 0.05
+    observation, _ = env.reset(options={"arc_length": 40.0, "lateral_error": 0.3})
+    _, memory = agent.predict(observation, None, BEGIN)
+    plan, lost = memory.plans[0].copy(), observation.copy()
+    lost[5] = np.nan
+    # At 0.05, 0.1, ... s; stages begin at 0, 0.03, 0.08, 0.13, 0.23, ... s.
+    followed = [agent.predict(lost)[0] for _ in range(6)]
+    np.testing.assert_allclose(followed, plan[[1, 2, 3, 3, 4, 4]], rtol=1e-6)
+
+
+def test_mirrored_observations_have_mirrored_actions() -> None:
+    rows = drives(17, 2)
+    sign = np.concatenate([[1, -1, -1, 1, -1, -1, -1, 1], -np.ones(20), np.ones(20)])
+    for settings in ({}, {"stages": UNEVEN}):
+        left, right = made(**settings), made(**settings)
+        for row in rows:
+            mirrored = right.predict(row * sign.astype(np.float32))[0]
+            np.testing.assert_allclose(mirrored, left.predict(row)[0] * [1, -1], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("stages", "nodes"),
+    [
+        (None, 20), ((0.2,) * 10, 20), ((0.05,) * 40, 20), ((0.05,) * 10, 5), ((0.3,) * 4, 12),
+        ((0.1, 0.02), 2), ((0.25,), 3), (UNEVEN, 16),
+    ],
+    ids=repr,
+)  # fmt: skip
+@pytest.mark.parametrize("name", ["lpv-nmpc", "lpv-nmpc-tuned"])
+def test_bands_are_chosen_by_the_preview_that_the_stages_reach(
+    name: str, stages: tuple[float, ...] | None, nodes: int
+) -> None:
+    schedule = WeightSchedule(
+        CurvatureBands((0.05,), ("straight", "sharp")),
+        (TrackingWeights(), TrackingWeights(R=(0.01, 5.0))),
+    )
+    env = environment(trajectory="straight")
+    agent = agents.make(name, env, stages=stages, weights=schedule)
+    observation, _ = env.reset(seed=0)
+    for k in range(20):
+        row = observation.copy()
+        row[PREVIEW_START + k] = 0.1
+        _, memory = agent.predict(row, episode_start=BEGIN)
+        in_use = agent.diagnostics(memory[0])["weights"]
+        np.testing.assert_array_equal(in_use, schedule.weights[k < nodes].as_array())
 
 
 def test_horizon_shorter_than_the_preview() -> None:

@@ -82,6 +82,56 @@ def test_bad_mappings_are_refused_in_one_line(
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("settings", "stages"),
+    [
+        ({}, [0.1] * 20),
+        ({"horizon": 7}, [0.1] * 7),
+        ({"stages": 0.2}, [0.2] * 10),
+        ({"stages": 0.3}, [0.3] * 6),
+        ({"stages": 1}, [1.0] * 2),
+        ({"stages": 0.05, "horizon": 30}, [0.05] * 30),
+        ({"stages": [0.1, 0.4]}, [0.1, 0.4]),
+        ({"stages": np.array([0.5, 1.5]), "horizon": 2}, [0.5, 1.5]),
+    ],
+    ids=str,
+)
+def test_stages_lie_within_the_preview(settings: dict[str, Any], stages: list[float]) -> None:
+    agent: Any = agents.make("lpv-nmpc", PathTrackingEnv("T2"), **settings)
+    np.testing.assert_array_equal(agent.problem.periods, stages)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"horizon": 21},
+            r"21 stages, 2\.1 s, is longer .* 20 steps of 0\.1 s: .*preview_steps=21$",
+        ),
+        ({"stages": 0.11, "horizon": 20}, r"20 stages, 2\.2 s, .*preview_steps=22$"),
+        ({"stages": (0.1,) * 19 + (0.11,)}, r"20 stages, 2\.01 s, .*preview_steps=21$"),
+        ({"stages": 2.5}, r"1 stages, 2\.5 s, .*preview_steps=25$"),
+        ({"stages": 1e-6}, "number of stages must be a whole number from 1 to 1,000, not 2000000"),
+        ({"stages": 0.0}, "stages must be positive and at most 10 s, not 0.0"),
+        ({"stages": float("nan")}, "stages must be positive and at most 10 s, not nan"),
+        ({"stages": "long"}, "stages must be positive and at most 10 s, not 'long'"),
+        ({"stages": ()}, "horizon must be a whole number from 1 to 1,000, not 0"),
+        ({"stages": (0.1, -0.1)}, r"stages\[1\] must be positive and at most 10 s, not -0.1"),
+        ({"stages": (0.1, 0.1), "horizon": 3}, "stages must be 3 numbers, each positive and"),
+        ({"stages": np.ones((2, 2))}, r"stages\[0\] must be positive and at most 10 s, not \["),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("name", ["lpv-nmpc", "lpv-nmpc-ipopt", "lpv-nmpc-tuned"])
+def test_bad_stages_are_refused_in_one_line(
+    name: str, settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message) as refused:
+        agents.make(name, PathTrackingEnv("T2"), **settings)
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) <= 300
+
+
 def test_other_settings_are_checked() -> None:
     with pytest.raises(ValueError, match=r"selection must be 'band' or 'path', not 'bands'"):
         NmpcSettings(selection="bands")
