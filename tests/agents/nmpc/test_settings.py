@@ -8,7 +8,7 @@ import pytest
 
 import agents
 from agents.base import DrivingTask
-from agents.nmpc.base import NmpcSettings
+from agents.nmpc.base import GROWTH, NmpcSettings, stages_of
 from agents.nmpc.frozen import FrozenLpvMpc
 from agents.nmpc.ipopt_agent import IpoptNmpc
 from agents.nmpc.rti_agent import RtiNmpc
@@ -16,6 +16,7 @@ from agents.registry import agent_class
 from agents.weight_tuning.agent import TunedNmpc
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.env import PathTrackingEnv
+from lpv_track_env.observation import ObservationLayout
 from trajectories import CurvatureBands
 
 SET = {"Q": [1, 1, 20, 20], "S": [5, 5, 100, 100], "R": [0.01, 1]}
@@ -85,8 +86,10 @@ def test_bad_mappings_are_refused_in_one_line(
 @pytest.mark.parametrize(
     ("settings", "stages"),
     [
-        ({}, [0.1] * 20),
-        ({"horizon": 7}, [0.1] * 7),
+        ({"stages": 0.1}, [0.1] * 20),
+        ({"stages": 0.1, "horizon": 7}, [0.1] * 7),
+        ({"horizon": 50}, [0.04] * 50),
+        ({"horizon": 1}, [2.0]),
         ({"stages": 0.2}, [0.2] * 10),
         ({"stages": 0.3}, [0.3] * 6),
         ({"stages": 1}, [1.0] * 2),
@@ -98,14 +101,40 @@ def test_bad_mappings_are_refused_in_one_line(
 )
 def test_stages_lie_within_the_preview(settings: dict[str, Any], stages: list[float]) -> None:
     agent: Any = agents.make("lpv-nmpc", PathTrackingEnv("T2"), **settings)
-    np.testing.assert_array_equal(agent.problem.periods, stages)
+    np.testing.assert_allclose(agent.problem.periods, stages, rtol=1e-12)
+
+
+@pytest.mark.parametrize("horizon", [None, 8, 15, 30])
+@pytest.mark.parametrize(("control", "first"), [(0.01, 0.05), (0.05, 0.05), (0.1, 0.1)])
+@pytest.mark.parametrize("preview", [(20, 0.1), (30, 0.2), (3, 0.1)])
+def test_stages_grow_by_one_factor_to_the_end_of_the_preview(
+    horizon: int | None, control: float, first: float, preview: tuple[int, float]
+) -> None:
+    seen = preview[0] * preview[1]
+    stages = np.array(
+        stages_of(NmpcSettings(horizon=horizon), ObservationLayout(*preview), control)
+    )
+    assert stages.sum() == pytest.approx(seen, rel=1e-9)
+    assert horizon in {None, len(stages)}
+    factors = stages[1:] / stages[:-1]
+    np.testing.assert_allclose(factors, factors.mean(), rtol=1e-9)
+    assert factors.mean() >= 1.0 - 1e-12
+    if len(stages) * first < seen:
+        assert stages[0] == pytest.approx(first)
+    if horizon is None:
+        # One stage less would have to grow faster.
+        assert factors.mean() <= GROWTH + 1e-9
+        less = stages_of(
+            NmpcSettings(horizon=len(stages) - 1), ObservationLayout(*preview), control
+        )
+        assert less[1] / less[0] > GROWTH
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         (
-            {"horizon": 21},
+            {"stages": 0.1, "horizon": 21},
             r"21 stages, 2\.1 s, is longer .* 20 steps of 0\.1 s: .*preview_steps=21$",
         ),
         ({"stages": 0.11, "horizon": 20}, r"20 stages, 2\.2 s, .*preview_steps=22$"),
