@@ -376,12 +376,15 @@ def test_the_solve_after_a_failed_one_begins_cold(nmpc: tuple[gymnasium.Env, Any
     for _ in range(20):
         start = np.array([len(rows) == 1])
         rows.append(env.step(agent.predict(rows[-1], episode_start=start)[0])[0])
-    warm, _ = agent.predict(rows[-1])
-    cold, _ = agent.predict(rows[-1], episode_start=np.array([True]))
+    warm = planned_inputs(agent.predict(rows[-1])[1])
+    action, memory = agent.predict(rows[-1], episode_start=np.array([True]))
+    cold = planned_inputs(memory)
     assert not np.array_equal(warm, cold)
     agent.predict(rows[-3], episode_start=np.array([True]))
     agent.predict(np.where(np.arange(len(rows[-2])) == 5, np.nan, rows[-2]))
-    np.testing.assert_array_equal(agent.predict(rows[-1])[0], cold)
+    again, memory = agent.predict(rows[-1])
+    np.testing.assert_array_equal(again, action)
+    np.testing.assert_array_equal(planned_inputs(memory), cold)
 
 
 def test_a_plan_that_is_used_up_is_followed_by_stanley() -> None:

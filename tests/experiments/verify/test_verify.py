@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agents.nmpc.casadi_solvers import IpoptSolver, discrete_model
+from agents.nmpc.casadi_solvers import IpoptSolver, stage_models
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.weights import TrackingWeights
 from experiments.cli import main
@@ -147,10 +147,10 @@ def test_excess_over_hard_bounds(
     assert price.excess == pytest.approx(excess, abs=1e-12)
 
 
-def test_roll_out_is_casadis_discrete_model(samplers: dict[str, Sampler]) -> None:
+def test_roll_out_is_casadis_stage_models(samplers: dict[str, Sampler]) -> None:
     for problem, case in draws(samplers, 4):
-        model, states = discrete_model(problem), rolled_out(problem, case.state, case.inputs)
-        for k, u in enumerate(case.inputs):
+        states = rolled_out(problem, case.state, case.inputs)
+        for k, (model, u) in enumerate(zip(stage_models(problem), case.inputs, strict=True)):
             same = np.asarray(model(states[k], u)).ravel()
             np.testing.assert_allclose(states[k + 1], same, rtol=1e-10, atol=1e-11)
 
