@@ -10,8 +10,8 @@ on several stages at a time. Every inequality is a pair (t, lam) with t lam -> 0
 "gap" is the distance to a bound::
 
      0.. 7   high, low of a, delta, a - a_before, delta - delta_before        t = gap
-     8.. 9   high, low of vx at the period's end,         10  its slack       t = gap + slack
-    11..12   high, low of vx' at the period's start,      13  its slack
+     8.. 9   high, low of vx at the stage's end,          10  its slack       t = gap + slack
+    11..12   high, low of vx' at the stage's start,       13  its slack
     14..15   ratio vx - vy, ratio vx + vy at the end,     16  their slack     t = slack
 """
 

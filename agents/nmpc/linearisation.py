@@ -1,15 +1,15 @@
 """The NMPC's discrete model and its exact derivatives, compiled.
 
 The model is that of `casadi_solvers.discrete_model`: classic Runge-Kutta steps of the vector field
-over a period, with constant inputs. A period is integrated in the frame of the vehicle at its
+over a stage, with constant inputs. A stage is integrated in the frame of the vehicle at its
 start, since the motion does not depend on position and heading: only small angles are rotated, and
 the derivatives by heading and position need no integration.
 
-The derivatives of a period are stored in its stage (`layout`), in this order::
+The derivatives of a stage are stored in its row (`layout`), in this order::
 
     0..17   columns vx, vy, r of A, six rows each     18, 19  A[X, psi], A[Y, psi]
     20..31  columns a, delta of B, six rows each
-    32      vx' at the period's start                 33..37  its derivatives by vx, vy, r, delta, a
+    32      vx' at the stage's start                  33..37  its derivatives by vx, vy, r, delta, a
 
 The other columns of A are unit vectors.
 """
@@ -47,7 +47,7 @@ HEADING_X, HEADING_Y, RATE, RATE_VX, RATE_VY, RATE_R, RATE_DELTA, RATE_A = (
 RESOLVED = 1.5
 """Largest product of a Runge-Kutta step that is chosen by speed and the fastest lateral pole."""
 SEEDS = 5
-"""Number of integrated directions: vx, vy, r at the period's start, a, delta."""
+"""Number of integrated directions: vx, vy, r at the stage's start, a, delta."""
 DYNAMIC = (VX, VY, YAW_RATE)
 
 
@@ -58,7 +58,7 @@ class Linearisation(NamedTuple):
     A: Array
     B: Array
     rate: Array
-    """vx' at each period's start, (N,) m/s^2."""
+    """vx' at each stage's start, (N,) m/s^2."""
     rate_x: Array
     """Derivatives of vx' by the state, (N, 6)."""
     rate_u: Array

@@ -14,7 +14,7 @@ period). The value function of stage i depends on dx_i and p = du_{i-1}:
     1/2 x' P x + x' T p + 1/2 p' U p + s' x + t' p
 
 `factor` computes the matrix part once for a Hessian, `solve` the vector part for each gradient. The
-derivatives of a period are described in `linearisation`, all arrays in `layout`.
+derivatives of a stage are described in `linearisation`, all arrays in `layout`.
 """
 
 import math
