@@ -8,6 +8,7 @@ from scipy.integrate import simpson
 
 import trajectories
 from agents.reference import (
+    NEAR_PATH,
     NODE,
     early_turn,
     fill_nodes,
@@ -151,6 +152,40 @@ def test_beyond_the_preview_the_reference_goes_on_along_its_last_arc():
         chord = 2.0 / 0.2 * math.sin(0.5 * turn)
         assert found.x[k + 1] - found.x[k] == pytest.approx(chord * math.cos(ahead))
         assert found.y[k + 1] - found.y[k] == pytest.approx(chord * math.sin(ahead))
+
+
+@pytest.mark.parametrize("speed", [0.0, 5.0, 20.0])
+@pytest.mark.parametrize("error", [0.0, 0.3, -NEAR_PATH, NEAR_PATH, 0.8, -2.0, 10.0])
+def test_a_vehicle_far_beside_the_path_is_led_back_to_it(error, speed):
+    """An offset that decays along the path, with the heading of the curve that it makes."""
+    row = observed(8.0, 0.02, 8.0)._replace(lateral_error=error, longitudinal_speed=speed)
+    lengths = np.full(200, 0.005)
+    path, led = (
+        local_reference(row, PERIOD, lengths, approaching=approaching)
+        for approaching in (False, True)
+    )
+    dx, dy = led.x - path.x, led.y - path.y
+    np.testing.assert_allclose(
+        dx * np.cos(path.heading) + dy * np.sin(path.heading), 0.0, atol=1e-9
+    )
+    offset = dy * c - dx * d
+    excess = max(abs(error) - NEAR_PATH, 0.0)
+    assert offset[0] == pytest.approx(math.copysign(excess, error))
+    if excess == 0.0:
+        for one, other in zip(led, path, strict=True):
+            np.testing.assert_array_equal(one, other)
+        return
+    assert (np.diff(np.abs(offset)) < 0.0).all()
+    slope = np.gradient(offset, path.arc_length)
+    tangent = np.tan(led.heading - path.heading)
+    np.testing.assert_allclose(tangent[1:-1], slope[1:-1], rtol=1e-3)
+    assert np.abs(slope).max() <= 0.4 + 1e-3
+    np.testing.assert_array_equal(led.speed, path.speed)
+    mirrored = local_reference(
+        observed(8.0, -0.02, 8.0)._replace(lateral_error=-error, longitudinal_speed=speed),
+        PERIOD, lengths, approaching=True,
+    )  # fmt: skip
+    np.testing.assert_allclose([mirrored.y, mirrored.heading], [-led.y, -led.heading], atol=1e-12)
 
 
 def test_points_between_behind_and_beyond():

@@ -2,13 +2,14 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import numba
 import numpy as np
 import pytest
 
 import agents
-from agents.nmpc import rti
+from agents.nmpc import layout, rti
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import PREVIEW_START
 from tests.helpers.driven_vehicles import drives, environment, made
@@ -306,6 +307,21 @@ def test_stages_of_any_length() -> None:
     # At 0.05, 0.1, ... s; stages begin at 0, 0.03, 0.08, 0.13, 0.23, ... s.
     followed = [agent.predict(lost)[0] for _ in range(6)]
     np.testing.assert_allclose(followed, plan[[1, 2, 3, 3, 4, 4]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("settings", [{}, {"stages": UNEVEN}], ids=str)
+def test_the_compiled_problem_is_that_of_the_situation(settings: dict[str, Any]) -> None:
+    """State and reference of a solve, which the solvers by CasADi get from Python."""
+    agent = made(**settings)
+    stages = layout.working_space(agent.problem.horizon, 1)[0][0]
+    for row in drives(17, 1)[0].astype(np.float64):
+        for lateral in (row[5], 1.7, -6.0):
+            row[5] = lateral
+            state, _, reference = agent.situation(agent.task.layout.unpack(row))
+            assert rti.load_observation(row, agent.solver.constants, stages)
+            found = stages[:, layout.REFERENCE : layout.REFERENCE_Y + 1]
+            np.testing.assert_allclose(found, reference, atol=1e-12)
+            np.testing.assert_array_equal(stages[0, layout.PLAN_VX : layout.PLAN_Y + 1], state)
 
 
 def test_mirrored_observations_have_mirrored_actions() -> None:
