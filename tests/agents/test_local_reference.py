@@ -165,9 +165,8 @@ def test_a_vehicle_far_beside_the_path_is_led_back_to_it(error, speed):
         for approaching in (False, True)
     )
     dx, dy = led.x - path.x, led.y - path.y
-    np.testing.assert_allclose(
-        dx * np.cos(path.heading) + dy * np.sin(path.heading), 0.0, atol=1e-9
-    )
+    c, d = np.cos(path.heading), np.sin(path.heading)
+    np.testing.assert_allclose(dx * c + dy * d, 0.0, atol=1e-9)
     offset = dy * c - dx * d
     excess = max(abs(error) - NEAR_PATH, 0.0)
     assert offset[0] == pytest.approx(math.copysign(excess, error))
