@@ -253,7 +253,8 @@ class TrackingAgent(ABC, Generic[Memory]):
         """Return details of the last step for one vehicle; empty if there are none.
 
         Known entries: status, seconds, iterations, cost, slack (3,), fallback, weights (12,) Q, S,
-        R in use, plan (N + 1, 2) of predicted positions in the frame of the path's foot point.
+        R, R_rate in use, plan (N + 1, 2) of predicted positions in the frame of the path's foot
+        point.
         """
         return {}
 

@@ -1,4 +1,4 @@
-"""Print the NMPC's diagnostics and its plan for the next second, at the start of a bend."""
+"""Print the NMPC's diagnostics and its plan for the next two seconds, at the start of a bend."""
 
 import argparse
 from typing import Any
@@ -27,9 +27,10 @@ def main() -> None:
     print(f"{solve['status']} in {1e6 * solve['seconds']:.0f} us, cost {solve['cost']:.3f}")
     print(f"action: {action[0]:.2f} m/s^2, {action[1]:.3f} rad; slack used: {solve['slack']}")
     # The origin of the plan is the nearest point of the path: x along its tangent, y to the left.
-    for node in range(0, len(solve["plan"]), 5):
+    for node in range(0, len(solve["plan"]), 3):
         x, y = solve["plan"][node]
-        print(f"in {0.05 * node:.2f} s: {x:6.2f} m ahead, {y:6.2f} m to the left")
+        time = agent.problem.times[node]
+        print(f"in {time:.2f} s: {x:6.2f} m ahead, {y:6.2f} m to the left")
 
 
 if __name__ == "__main__":

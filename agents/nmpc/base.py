@@ -133,7 +133,8 @@ def stages_of(
         return growing_stages(max(control_period, SHORTEST_STAGE), seen, settings.horizon)
     lengths = settings.stages
     if isinstance(lengths, float):
-        lengths = (lengths,) * (settings.horizon or max(int(seen / lengths + 1e-6), 1))
+        most = max(int(seen / lengths + 1e-6), 1) if settings.horizon is None else settings.horizon
+        lengths = (lengths,) * HORIZON.of("the number of stages", most)
     if sum(lengths) > seen * (1.0 + 1e-6):
         steps = math.ceil(sum(lengths) / period - 1e-6)
         raise ValueError(
@@ -175,6 +176,7 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
             linear_penalty=settings.linear_penalty,
             quadratic_penalty=settings.quadratic_penalty,
         )
+        self.preview_steps = self.problem.preview_steps(task.layout.preview_period)
         self.max_failures = settings.max_failures
         self._stanley = Stanley(task)
         self.rejected_weights = 0

@@ -213,7 +213,7 @@ class _NlpSolver(ABC):
         """Solve from `state` (6,), with the input in force (2,) and the weights (12,).
 
         `reference` is (N + 1, 4). `warm` is the warm start that the last solve returned, shifted by
-        one period here. Never raises: the status reports failures.
+        one stage here. Never raises: the status reports failures.
         """
         began = time.perf_counter()
         parameters = self.problem.parameters(state, last_input, reference, weights)

@@ -69,7 +69,7 @@ class FrozenLpvSolver:
         last = np.clip(last_input, low, high)
         plan = np.tile(last, (self.problem.horizon, 1))
         if warm is not None:
-            plan[:-1], plan[-1] = warm[1:], warm[-1]
+            plan = self._rti.shifted(warm)
         model = self.freeze(state, plan, reference[:, 1])
         solution = self._rti.solve_model(model, last, reference, weights, plan)
         return solution._replace(seconds=time.perf_counter() - began), solution.inputs

@@ -63,7 +63,7 @@ class SolvedNmpc(NmpcAgent[NmpcMemory]):
         """Return the first input of the plan, or of the fallback if the solve fails."""
         state, last, reference = self.situation(observation)
         flat = np.concatenate([np.ravel(entry) for entry in observation]).astype(np.float64)
-        self.switching.choose(flat[None], self.problem.horizon, memory.band, memory.weights)
+        self.switching.choose(flat[None], self.preview_steps, memory.band, memory.weights)
         solution, warm = self.solver.solve(state, last, reference, memory.weights[0], memory.warm)
         memory.solution = solution
         if solution.status is Status.SUCCESS and solution.inputs is not None:

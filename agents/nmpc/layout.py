@@ -10,8 +10,8 @@ on several stages at a time. Every inequality is a pair (t, lam) with t lam -> 0
 "gap" is the distance to a bound::
 
      0.. 7   high, low of a, delta, a - a_before, delta - delta_before        t = gap
-     8.. 9   high, low of vx at the period's end,         10  its slack       t = gap + slack
-    11..12   high, low of vx' at the period's start,      13  its slack
+     8.. 9   high, low of vx at the stage's end,          10  its slack       t = gap + slack
+    11..12   high, low of vx' at the stage's start,       13  its slack
     14..15   ratio vx - vy, ratio vx + vy at the end,     16  their slack     t = slack
 """
 
@@ -23,18 +23,18 @@ from trajectories.compilation import compiled_in_place
 Array = NDArray[np.float64]
 
 # Entries of `constants` after the 7 parameters of the model: fastest lateral pole at 1 m/s by which
-# Runge-Kutta steps are chosen (0: the grid's), spacing of the preview, the QP's tolerance; bounds
-# of the action space; of inputs, and of the soft constraints on vx, vx' and |vy| / vx; their linear
-# and quadratic penalties; Levenberg terms.
+# Runge-Kutta steps are chosen (0: the grid's), spacing of the preview and number of its steps
+# within the stages, the QP's tolerance; bounds of the action space; of inputs, and of the soft
+# constraints on vx, vx' and |vy| / vx; their linear and quadratic penalties; Levenberg terms.
 (
-    POLE, PREVIEW_PERIOD, TOLERANCE,
+    POLE, PREVIEW_PERIOD, PREVIEW_STEPS, TOLERANCE,
     SPACE_LOW_A, SPACE_LOW_DELTA, SPACE_HIGH_A, SPACE_HIGH_DELTA,
     LOW_A, HIGH_A, MAX_DELTA,
     LOW_SPEED, HIGH_SPEED, LOW_RATE, HIGH_RATE, RATIO,
     LINEAR, LINEAR_RATE, LINEAR_RATIO, QUADRATIC, QUADRATIC_RATE, QUADRATIC_RATIO,
     DAMPING_A, DAMPING_DELTA,
-) = range(7, 30)  # fmt: skip
-CONSTANTS_SIZE = 30
+) = range(7, 31)  # fmt: skip
+CONSTANTS_SIZE = 31
 # Rows of `grid`, an entry a stage: its length (s), Runge-Kutta steps, length by the nominal period,
 # weight of a squared change of input by that of a squared rate, largest changes of a and delta,
 # share of the way to the next stage's input by which a plan is shifted.

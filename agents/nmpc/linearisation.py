@@ -1,15 +1,15 @@
 """The NMPC's discrete model and its exact derivatives, compiled.
 
 The model is that of `casadi_solvers.discrete_model`: classic Runge-Kutta steps of the vector field
-over a period, with constant inputs. A period is integrated in the frame of the vehicle at its
+over a stage, with constant inputs. A stage is integrated in the frame of the vehicle at its
 start, since the motion does not depend on position and heading: only small angles are rotated, and
 the derivatives by heading and position need no integration.
 
-The derivatives of a period are stored in its stage (`layout`), in this order::
+The derivatives of a stage are stored in its row (`layout`), in this order::
 
     0..17   columns vx, vy, r of A, six rows each     18, 19  A[X, psi], A[Y, psi]
     20..31  columns a, delta of B, six rows each
-    32      vx' at the period's start                 33..37  its derivatives by vx, vy, r, delta, a
+    32      vx' at the stage's start                  33..37  its derivatives by vx, vy, r, delta, a
 
 The other columns of A are unit vectors.
 """
@@ -47,7 +47,7 @@ HEADING_X, HEADING_Y, RATE, RATE_VX, RATE_VY, RATE_R, RATE_DELTA, RATE_A = (
 RESOLVED = 1.5
 """Largest product of a Runge-Kutta step that is chosen by speed and the fastest lateral pole."""
 SEEDS = 5
-"""Number of integrated directions: vx, vy, r at the period's start, a, delta."""
+"""Number of integrated directions: vx, vy, r at the stage's start, a, delta."""
 DYNAMIC = (VX, VY, YAW_RATE)
 
 
@@ -58,7 +58,7 @@ class Linearisation(NamedTuple):
     A: Array
     B: Array
     rate: Array
-    """vx' at each period's start, (N,) m/s^2."""
+    """vx' at each stage's start, (N,) m/s^2."""
     rate_x: Array
     """Derivatives of vx' by the state, (N, 6)."""
     rate_u: Array
@@ -105,25 +105,25 @@ def mixed(a: Float, x: Six, b: Float, y: Six) -> Six:
 
 
 @compiled_internal
-def substeps(vx: Float, a: Float, length: Float, most: Float, p: Array) -> int:
-    """Return the Runge-Kutta steps of a stage that starts at vx (m/s), at most the grid's.
+def substeps(vx: Float, a: Float, length: Float, grids: Float, p: Array) -> int:
+    """Return the Runge-Kutta steps of a stage that starts at vx (m/s), by default the grid's.
 
-    Where `p` names a pole, the steps resolve it at the lowest speed of the stage.
+    Where `p` names a pole, the steps resolve it at the lowest speed of the stage, even standstill.
     """
     if p[L.POLE] <= 0.0:
-        return int(most)
+        return int(grids)
     slowest = max(abs(vx) - abs(a) * length, 0.0)
     wanted = math.ceil(length * p[L.POLE] * compiled_inverse_speed(slowest) * (1.0 / RESOLVED))
-    return int(min(max(wanted, 1.0), most))
+    return int(max(wanted, 1.0))
 
 
 @compiled_internal
-def advance(state: Any, a: Float, delta: Float, length: Float, most: Float, p: Array) -> Any:
+def advance(state: Any, a: Float, delta: Float, length: Float, grids: Float, p: Array) -> Any:
     """State (vx, vy, psi, r, X, Y) after a stage of `length` s with constant inputs.
 
-    `most` are the grid's Runge-Kutta steps of the stage, and `p` the constants.
+    `grids` are the grid's Runge-Kutta steps of the stage, and `p` the constants.
     """
-    n = substeps(state[VX], a, length, most, p)
+    n = substeps(state[VX], a, length, grids, p)
     vx, vy, psi, r, x, y = integrate(
         state[VX], state[VY], 0.0, state[YAW_RATE], 0.0, 0.0, a, delta,
         p[0], p[1], p[2], p[3], p[4], p[5], p[6], length / n, n,
@@ -181,7 +181,7 @@ def _weighted(k1: Any, k2: Any, k3: Any, k4: Any) -> Any:
 
 
 @compiled_internal
-def differentiate(e: Array, length: Float, most: Float, p: Array, out: Array) -> None:
+def differentiate(e: Array, length: Float, grids: Float, p: Array, out: Array) -> None:
     """Advance the plan's state from stage e to the next, `out`, and fill the derivatives of e.
 
     The state is that of `advance`, which describes the arguments. Forward sensitivities through the
@@ -191,7 +191,7 @@ def differentiate(e: Array, length: Float, most: Float, p: Array, out: Array) ->
     model = (p[0], p[1], p[2], p[3], p[4], p[5], p[6])
     a, delta = e[L.PLAN_A], e[L.PLAN_DELTA]
     vx, vy, r = e[L.PLAN_VX], e[L.PLAN_VY], e[L.PLAN_R]
-    n = substeps(vx, a, length, most, p)
+    n = substeps(vx, a, length, grids, p)
     h = length / n
     c, s, psi, x, y = 1.0, 0.0, 0.0, 0.0, 0.0
     cd, sd = math.cos(delta), math.sin(delta)
@@ -261,9 +261,9 @@ def differentiate(e: Array, length: Float, most: Float, p: Array, out: Array) ->
 def differentiate_along(stages: Array, constants: Array) -> None:
     """Roll the plan in `stages` out from its first state, and fill all stages' derivatives."""
     n = stages.shape[0] - 1
-    lengths, most = L.grid(constants, L.LENGTH, n), L.grid(constants, L.SUBSTEPS, n)
+    lengths, grids = L.grid(constants, L.LENGTH, n), L.grid(constants, L.SUBSTEPS, n)
     for i in range(n):
-        differentiate(stages[i], lengths[i], most[i], constants, stages[i + 1])
+        differentiate(stages[i], lengths[i], grids[i], constants, stages[i + 1])
 
 
 def unpacked(stages: Array) -> Linearisation:

@@ -144,6 +144,10 @@ class NmpcProblem:
         """Times of the nodes, (N + 1,) s."""
         return np.concatenate([[0.0], np.cumsum(self.periods)])
 
+    def preview_steps(self, period: float) -> int:
+        """Return how many intervals of a preview, each of `period` s, the stages reach into."""
+        return math.ceil(float(self.times[-1]) / period - 1e-6)
+
     @property
     def substeps(self) -> NDArray[np.int64]:
         """Runge-Kutta steps of each stage (N,), for stability from the least permitted speed on.

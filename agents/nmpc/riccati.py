@@ -9,12 +9,12 @@ A step minimises, over dx_0 = 0, dx_{i+1} = A_i dx_i + B_i du_i and du_{-1} = 0,
 with n_i the gradient of vx', Hu and W diagonal, and Hx diagonal except for the block of (vx, vy).
 Hessians and gradients are those of the cost, at the solution so far, plus the terms of the
 inequalities (barrier and slope in the lanes of `layout`; those of vx and vy hold at the end of a
-period). The value function of stage i depends on dx_i and p = du_{i-1}:
+stage). The value function of stage i depends on dx_i and p = du_{i-1}:
 
     1/2 x' P x + x' T p + 1/2 p' U p + s' x + t' p
 
 `factor` computes the matrix part once for a Hessian, `solve` the vector part for each gradient. The
-derivatives of a period are described in `linearisation`, all arrays in `layout`.
+derivatives of a stage are described in `linearisation`, all arrays in `layout`.
 """
 
 import math

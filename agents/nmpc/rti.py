@@ -120,9 +120,9 @@ def solve(
     stats[INNER] = stats[OUTER] = 0.0
     clamp(stages, L.PLAN_A, last_a, last_delta, constants)
     n = lanes.shape[1]
-    lengths, most = L.grid(constants, L.LENGTH, n), L.grid(constants, L.SUBSTEPS, n)
+    lengths, grids = L.grid(constants, L.LENGTH, n), L.grid(constants, L.SUBSTEPS, n)
     for i in range(n):
-        differentiate(stages[i], lengths[i], most[i], constants, stages[i + 1])
+        differentiate(stages[i], lengths[i], grids[i], constants, stages[i + 1])
     code = solve_qp(stages, lanes, last_a, last_delta, weights, constants, stats)
     stats[COST] = math.nan
     if code == SUCCESS:

@@ -136,7 +136,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         # Called with zero rows to trigger compilation here, not in the first control period.
         blank, none = self._new(0), np.zeros((0, self._size))
         self._blank = blank
-        self.switching.choose(none, self.problem.horizon, blank.bands, blank.weights)
+        self.switching.choose(none, self.preview_steps, blank.bands, blank.weights)
         self.solve_rows(none, self.fixed_weights, blank)
         observation_rows(none, self._size)
 
@@ -182,7 +182,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         for row in started_rows(episode_start, len(rows)):
             memory.clear(row)
         if self.has_schedule:
-            self.switching.choose(rows, self.problem.horizon, memory.bands, memory.weights)
+            self.switching.choose(rows, self.preview_steps, memory.bands, memory.weights)
             weights = memory.weights
         else:
             weights = self.fixed_weights

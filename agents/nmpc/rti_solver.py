@@ -49,14 +49,14 @@ def roll_out_cost(
 ) -> Float:
     """Roll the inputs in the stages' STEP out, fill the slacks, and return the exact cost."""
     p, n = constants, lanes.shape[1]
-    lengths, most = L.grid(p, L.LENGTH, n), L.grid(p, L.SUBSTEPS, n)
+    lengths, grids = L.grid(p, L.LENGTH, n), L.grid(p, L.SUBSTEPS, n)
     for k in range(2, L.POINT):
         stages[0, L.STEP_A + k] = stages[0, L.PLAN_A + k]
     for i in range(n):
         e, end = stages[i], stages[i + 1]
         a, delta = e[L.STEP_A], e[L.STEP_DELTA]
         following = linearisation.advance(
-            linearisation.taken(e, L.STEP_VX), a, delta, lengths[i], most[i], p
+            linearisation.taken(e, L.STEP_VX), a, delta, lengths[i], grids[i], p
         )
         for k in range(6):
             end[L.STEP_VX + k] = following[k]
@@ -213,11 +213,13 @@ class RtiSolver:
         self.damping = numbers("damping", damping, Number(0.0, 1e9), INPUTS)
         car, order, periods = problem.vehicle, np.array(L.SLACK_OF), problem.periods
         first = periods[0] if problem.first_period is None else problem.first_period
+        preview = periods[0] if preview_period is None else preview_period
         self.constants = np.array(
             [
                 *car.as_array(),
                 fastest_pole(LOW_SPEED, car) if steps_by_speed else 0.0,
-                periods[0] if preview_period is None else preview_period,
+                preview,
+                problem.preview_steps(preview),
                 tolerance,
                 *np.concatenate(problem.input_bounds).astype(np.float32),
                 *car.acceleration_range,
@@ -267,8 +269,7 @@ class RtiSolver:
         if warm is None:
             plan = np.tile(last, (n, 1))
         else:
-            plan = warm.copy()
-            plan[:-1] += self._shift[:-1, None] * (plan[1:] - plan[:-1])
+            plan = self.shifted(warm)
         given = state, last, reference, np.ascontiguousarray(weights, dtype=np.float64)
         if self._iterations == 1:
             self._prepare(state, plan, reference)
@@ -302,6 +303,12 @@ class RtiSolver:
             seconds,
         )
         return solution, plan
+
+    def shifted(self, plan: Array) -> Array:
+        """Return a plan (N, 2) moved on by one control period; its end is held."""
+        moved = plan.copy()
+        moved[:-1] += self._shift[:-1, None] * (plan[1:] - plan[:-1])
+        return moved
 
     def _bounded(self, inputs: Array, last: Array) -> Array:
         """Return inputs (N, 2) clipped to their bounds and rates."""

@@ -172,7 +172,7 @@ class TunedNmpc:
             weights, policy = memory.weights(memory.tables, decider.rules), decider.arrays
         before = (
             rows, arrays, weights, policy, nmpc.actions, self._nodes, self._layers,
-            self.nmpc.problem.horizon, self.task.control_period,
+            self.nmpc.preview_steps, self.task.control_period,
         )  # fmt: skip
         after = (arrays, nmpc.actions, nmpc.stats)
         if self._prepare is None or self._finish is None:

@@ -177,9 +177,9 @@ class ClosedLoop:
         periods
             At least 1.
         weights
-            Q, S, R: (12,) for all, (n, 12), or (n, bands, 12) where the loop has bands; by default
-            the agent's own weights or schedule. Rows with entries that are negative or not finite
-            are refused, others are clipped to the bounds of weights.
+            Q, S, R, R_rate: (12,) for all, (n, 12), or (n, bands, 12) where the loop has bands; by
+            default the agent's own weights or schedule. Rows with entries that are negative or not
+            finite are refused, others are clipped to the bounds of weights.
         until_band
             Stop an environment before the first solve in another band, so that it can be given
             other weights; `memory.nmpc.bands` and `memory.history` then are those of the next
@@ -239,7 +239,7 @@ class ClosedLoop:
         loops.take_in_rows(
             mask, self.envs.arrays.observations, memory.arrays,
             memory.weights(memory.tables, self._rules), memory.nmpc.actions, self._work.nodes[0],
-            self.agent.problem.horizon, self.envs.single.control_period,
+            self.agent.preview_steps, self.envs.single.control_period,
         )  # fmt: skip
 
     def _drive_rows(self, arguments: tuple[Any, ...]) -> None:

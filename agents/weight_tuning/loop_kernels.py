@@ -7,6 +7,7 @@ import numba
 from numpy.typing import NDArray
 
 from agents.delay import predict_observation
+from agents.nmpc import layout as nmpc_layout
 from agents.nmpc import rti
 from agents.nmpc.qp import CODE, INNER, SUCCESS
 from agents.nmpc.rti import NmpcArrays
@@ -118,7 +119,7 @@ def push_command(commands: Array, a: Any, delta: Any) -> None:
 @compiled_internal
 def take_in(
     row: int, observations: Array, memory: MemoryArrays, weights: WeightArrays, actions: Array,
-    nodes: Array, horizon: int, period: Any,
+    nodes: Array, steps: int, period: Any,
 ) -> None:  # fmt: skip
     """Take a vehicle's observation in, once a period: NMPC's observation, band and history."""
     own = memory.history[row]
@@ -129,25 +130,25 @@ def take_in(
         observations[row], memory.commands[row], memory.foot_points[row], memory.delays, nodes,
         shown,
     )  # fmt: skip
-    update_band(shown, horizon, weights.rules, weights.bands, row)
+    update_band(shown, steps, weights.rules, weights.bands, row)
     update_history(own, observations[row], actions[row, 0], actions[row, 1], period)
 
 
 @compiled
 def take_in_rows(
     mask: Array, observations: Array, memory: MemoryArrays, weights: WeightArrays, actions: Array,
-    nodes: Array, horizon: int, period: Any,
+    nodes: Array, steps: int, period: Any,
 ) -> None:  # fmt: skip
     """`take_in` for every row that `mask` (n,) marks."""
     for row in range(mask.shape[0]):
         if mask[row]:
-            take_in(row, observations, memory, weights, actions, nodes, horizon, period)
+            take_in(row, observations, memory, weights, actions, nodes, steps, period)
 
 
 @compiled_internal
 def update_weights(
     row: int, observations: Array, memory: MemoryArrays, weights: WeightArrays,
-    policy: PolicyArrays, layers: Array, horizon: int,
+    policy: PolicyArrays, layers: Array, steps: int,
 ) -> None:  # fmt: skip
     """Update a vehicle's weights in use after `take_in`; a policy first decides, if due."""
     table = weights.tables[row if weights.tables.shape[0] > 1 else 0]
@@ -157,7 +158,7 @@ def update_weights(
             table, layers,
         )  # fmt: skip
     choose_weights(
-        memory.nmpc_observations[row], horizon, table, weights.rules, weights.bands, row,
+        memory.nmpc_observations[row], steps, table, weights.rules, weights.bands, row,
         weights.in_use[row],
     )  # fmt: skip
 
@@ -180,14 +181,14 @@ def act(
     SOLVE_FAILED if its solve fails, PAUSED if with `until_band` its band is another than the first.
     """
     if run.phases[row] == SOLVE:
-        horizon = work.lanes.shape[1]
-        take_in(row, observations, memory, weights, nmpc.actions, work.nodes, horizon, period)
+        steps = int(nmpc.constants[nmpc_layout.PREVIEW_STEPS])
+        take_in(row, observations, memory, weights, nmpc.actions, work.nodes, steps, period)
         if until_band:
             if run.first_bands[row] == NO_BAND:
                 run.first_bands[row] = weights.bands[row]
             if run.first_bands[row] != weights.bands[row]:
                 return PAUSED
-        update_weights(row, observations, memory, weights, policy, work.layers, horizon)
+        update_weights(row, observations, memory, weights, policy, work.layers, steps)
         failed = rti.control(
             row, memory.nmpc_observations[row : row + 1], weights.in_use[row : row + 1],
             nmpc.constants, nmpc.plans, nmpc.flags, nmpc.stats, nmpc.states, nmpc.actions,
@@ -290,12 +291,12 @@ def drive_in_threads(
 @compiled
 def prepare_rows(
     observations: Array, memory: MemoryArrays, weights: WeightArrays, policy: PolicyArrays,
-    actions: Array, nodes: Array, layers: Array, horizon: int, period: Any,
+    actions: Array, nodes: Array, layers: Array, steps: int, period: Any,
 ) -> None:  # fmt: skip
     """Take observations (n, size) float32 in, and update the weights in use."""
     for row in range(observations.shape[0]):
-        take_in(row, observations, memory, weights, actions, nodes, horizon, period)
-        update_weights(row, observations, memory, weights, policy, layers, horizon)
+        take_in(row, observations, memory, weights, actions, nodes, steps, period)
+        update_weights(row, observations, memory, weights, policy, layers, steps)
 
 
 @compiled

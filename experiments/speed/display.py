@@ -43,7 +43,7 @@ PANELS = {
     "single": Panel(1e6, "µs per step"),
     "vector": Panel(1e9, "ns per env-step", "n", "environments stepped together"),
     "solvers": Panel(1e3, "ms per predict (stroke: 99th percentile)"),
-    "horizons": Panel(1e3, "ms per predict", "horizon", "horizon N, periods", doubling=False),
+    "horizons": Panel(1e3, "ms per predict", "horizon", "stages N", doubling=False),
     "batches": Panel(1e3, "ms per solve", "n", "observations in a batch"),
     "loops": Panel(
         1e6, "µs per environment and control period", "n", "environments in a call"

@@ -43,7 +43,8 @@ SOLVERS: dict[str, tuple[str, dict[str, Any]]] = {
 """Agent name and settings by label; the first is compared with the others."""
 START = {"lateral_error": 0.2, "heading_error": 0.03, "speed_error": -0.3}
 """Initial errors of a window, which the agent has to correct, m, rad, m/s."""
-CONTROL_PERIOD, HORIZON = 0.05, 20
+CONTROL_PERIOD, HORIZON = 0.05, 15
+"""s, and the number of stages that the NMPC has by default then."""
 SLOW_BATCH = 16
 """Largest batch for an agent that solves its rows one by one with IPOPT."""
 TRIES = 3
@@ -67,19 +68,14 @@ class Window:
     observations: Observations
 
 
-def environment(trajectory: str, horizon: int = HORIZON) -> gymnasium.Env[Any, Any]:
+def environment(trajectory: str) -> gymnasium.Env[Any, Any]:
     """Make the environment that the solvers are measured on."""
-    return gymnasium.make(
-        PATH_TRACKING,
-        trajectory=trajectory,
-        control_period=CONTROL_PERIOD,
-        preview_steps=horizon,
-    )
+    return gymnasium.make(PATH_TRACKING, trajectory=trajectory, control_period=CONTROL_PERIOD)
 
 
-def record(trajectory: str, horizon: int, windows: int, length: int) -> list[Window]:
+def record(trajectory: str, windows: int, length: int) -> list[Window]:
     """Record windows of a closed loop from `windows` evenly spaced places on a trajectory."""
-    env = environment(trajectory, horizon)
+    env = environment(trajectory)
     driver = agents.make(DRIVER, env)
     path = env.unwrapped.path  # type: ignore[attr-defined]
     recorded = []
@@ -122,17 +118,21 @@ def solve_times(agent: agents.base.Agent, window: Window) -> list[float]:
 def solvers(section: Section, effort: Effort, tick: Tick) -> None:
     """Measure every solver on recorded control periods."""
     section.notes.append(
-        f"Seconds per predict(), all in, from Python, one thread, one vehicle; N {HORIZON}, Ts "
-        f"{CONTROL_PERIOD} s. Windows of {effort.window} consecutive control periods of a closed "
-        f"loop on {' and '.join(effort.trajectories)}, each started 0.2 m off the path; the first "
-        "solve of a window is a series of its own. A ratio is that of two medians over one window."
+        f"Seconds per predict(), all in, from Python, one thread, one vehicle; N {HORIZON}, a "
+        f"control period of {CONTROL_PERIOD} s. Windows of {effort.window} consecutive control "
+        f"periods of a closed loop on {' and '.join(effort.trajectories)}, each started 0.2 m off "
+        "the path; the first solve of a window is a series of its own. A ratio is that of two "
+        "medians over one window."
     )
     _over_windows(section, effort, tick, HORIZON, effort.windows)
 
 
 def horizons(section: Section, effort: Effort, tick: Tick) -> None:
-    """Measure every solver over the horizon N."""
-    section.notes.append("As above, on one window of each trajectory per horizon of N periods.")
+    """Measure every solver over the number of stages N."""
+    section.notes.append(
+        "As above, on one window of each trajectory per number N of stages, which end with the "
+        "same preview."
+    )
     for horizon in effort.horizons:
         _over_windows(section, effort, tick, horizon, 1)
 
@@ -142,9 +142,11 @@ def _over_windows(section: Section, effort: Effort, tick: Tick, horizon: int, wi
 
     A window's first solve has no warm start and is kept apart: there is one per episode.
     """
-    recorded = _recorded(effort, tick, horizon, windows)
-    env = environment(effort.trajectories[0], horizon)
-    made = section.available({label: partial(make, label, env) for label in SOLVERS})
+    recorded = _recorded(effort, tick, windows)
+    env = environment(effort.trajectories[0])
+    made = section.available(
+        {label: partial(make, label, env, horizon=horizon) for label in SOLVERS}
+    )
     series: dict[str, tuple[Series, Series, Series]] = {}
     for label, agent in made.items():
         warm, cold, median = (
@@ -166,12 +168,12 @@ def _over_windows(section: Section, effort: Effort, tick: Tick, horizon: int, wi
         section.compare(series[ours][2], series[other][2])
 
 
-def _recorded(effort: Effort, tick: Tick, horizon: int, windows: int) -> list[Window]:
+def _recorded(effort: Effort, tick: Tick, windows: int) -> list[Window]:
     """Record `windows` windows on each trajectory."""
     recorded: list[Window] = []
     for trajectory in effort.trajectories:
-        tick(f"recording {trajectory}, N {horizon}")
-        recorded += record(trajectory, horizon, windows, effort.window)
+        tick(f"recording {trajectory}")
+        recorded += record(trajectory, windows, effort.window)
     return recorded
 
 
@@ -181,7 +183,7 @@ def policies(section: Section, effort: Effort, tick: Tick) -> None:
         "Seconds per predict(), all in, from Python, one thread, one vehicle, over windows of "
         f"{effort.window} control periods of a closed loop."
     )
-    windows = _recorded(effort, tick, HORIZON, effort.windows)
+    windows = _recorded(effort, tick, effort.windows)
     env = environment(effort.trajectories[0])
     made = {name: agents.make(name, env) for name in (*LEARNED, NMPC)}
     series = {name: section.add(name, PREDICT) for name in made}
@@ -202,7 +204,7 @@ def batches(section: Section, effort: Effort, tick: Tick) -> None:
     trajectory = effort.trajectories[0]
     env = environment(trajectory)
     tick(f"batches: recording {trajectory}")
-    recorded = record(trajectory, HORIZON, effort.windows, effort.window)
+    recorded = record(trajectory, effort.windows, effort.window)
     stream = np.concatenate([window.observations for window in recorded])
     factories = {
         (NMPC, 1): partial(make, NMPC, env),

@@ -4,10 +4,15 @@ import math
 
 import numpy as np
 import pytest
+from scipy.integrate import simpson
 
 import trajectories
 from agents.reference import (
+    NEAR_PATH,
+    NODE,
     early_turn,
+    fill_nodes,
+    fill_nodes_at,
     lagged_sideslip,
     local_reference,
     mean_curvature,
@@ -80,6 +85,106 @@ def test_a_batch_is_its_rows():
     for many, one in zip(batch, single, strict=True):
         assert many.shape == (3, 4, 21)
         np.testing.assert_allclose(many[2, 1], one, rtol=1e-12)
+
+
+def drawn(rng):
+    """Speed at the foot point, and speeds (20,) and curvatures (20,) of a lively preview."""
+    return rng.uniform(0.0, 5.0), rng.uniform(-0.5, 0.5, 20), rng.uniform(0.0, 5.0, 20)
+
+
+def test_nodes_at_the_previews_own_times_are_its_nodes():
+    rng = np.random.default_rng(2)
+    for count in (1, 7, 20):
+        first, curvature, speed = drawn(rng)
+        mine, whole = np.zeros((count + 1, NODE)), np.zeros((count + 1, NODE))
+        fill_nodes_at(curvature, first, speed, PERIOD, np.full(count, PERIOD), mine)
+        fill_nodes(curvature, first, speed, PERIOD, whole)
+        np.testing.assert_allclose(mine, whole, rtol=1e-12, atol=1e-12)
+
+
+def test_nodes_at_any_times_lie_on_the_previews_arcs():
+    """Against numerical integration, across the intervals' boundaries."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        first, curvature, speed = drawn(rng)
+        lengths = rng.dirichlet(np.ones(9)) * 20 * PERIOD
+        found = local_reference(observed(first, curvature, speed), PERIOD, lengths)
+        speeds = np.concatenate([[first], speed])
+        known = PERIOD * np.arange(21)
+        for node, time in enumerate(np.concatenate([[0.0], np.cumsum(lengths)])):
+            x = y = heading = s = 0.0
+            for k in range(20):
+                end = min(time, known[k + 1])
+                if end <= known[k]:
+                    break
+                # Simpson's rule on a hundred steps; the heading is quadratic in time.
+                t = np.linspace(known[k], end, 201)
+                slope = (speeds[k + 1] - speeds[k]) / PERIOD
+                gone = speeds[k] * (t - known[k]) + 0.5 * slope * (t - known[k]) ** 2
+                angle, v = heading + curvature[k] * gone, speeds[k] + slope * (t - known[k])
+                x, y = x + simpson(v * np.cos(angle), x=t), y + simpson(v * np.sin(angle), x=t)
+                heading, s = angle[-1], s + gone[-1]
+            wanted = (s, x, y, heading, np.interp(time, known, speeds))
+            np.testing.assert_allclose([value[node] for value in found], wanted, atol=1e-9)
+
+
+def test_nodes_do_not_depend_on_those_between():
+    rng = np.random.default_rng(4)
+    first, curvature, speed = drawn(rng)
+    seen = observed(first, curvature, speed)
+    fine = np.repeat([0.01, 0.035, 0.05, 0.12], 4)
+    coarse = fine.reshape(-1, 4).sum(axis=1)
+    one, other = (local_reference(seen, PERIOD, lengths) for lengths in (fine, coarse))
+    for many, few in zip(one, other, strict=True):
+        np.testing.assert_allclose(many[::4], few, rtol=1e-12, atol=1e-12)
+
+
+def test_beyond_the_preview_the_reference_goes_on_along_its_last_arc():
+    first, curvature, speed = drawn(np.random.default_rng(5))
+    curvature[-1], speed[-1] = 0.2, 3.0
+    lengths = np.array([19.5 * PERIOD, 0.5 * PERIOD, 0.4, 1.3])
+    found = local_reference(observed(first, curvature, speed), PERIOD, lengths)
+    np.testing.assert_allclose(found.speed[2:], 3.0)
+    np.testing.assert_allclose(np.diff(found.arc_length)[2:], [1.2, 3.9])
+    np.testing.assert_allclose(np.diff(found.heading)[2:], [0.24, 0.78])
+    for k, turn in ((2, 0.24), (3, 0.78)):
+        ahead = found.heading[k] + 0.5 * turn
+        chord = 2.0 / 0.2 * math.sin(0.5 * turn)
+        assert found.x[k + 1] - found.x[k] == pytest.approx(chord * math.cos(ahead))
+        assert found.y[k + 1] - found.y[k] == pytest.approx(chord * math.sin(ahead))
+
+
+@pytest.mark.parametrize("speed", [0.0, 5.0, 20.0])
+@pytest.mark.parametrize("error", [0.0, 0.3, -NEAR_PATH, NEAR_PATH, 0.8, -2.0, 10.0])
+def test_a_vehicle_far_beside_the_path_is_led_back_to_it(error, speed):
+    """An offset that decays along the path, with the heading of the curve that it makes."""
+    row = observed(8.0, 0.02, 8.0)._replace(lateral_error=error, longitudinal_speed=speed)
+    lengths = np.full(200, 0.005)
+    path, led = (
+        local_reference(row, PERIOD, lengths, approaching=approaching)
+        for approaching in (False, True)
+    )
+    dx, dy = led.x - path.x, led.y - path.y
+    c, d = np.cos(path.heading), np.sin(path.heading)
+    np.testing.assert_allclose(dx * c + dy * d, 0.0, atol=1e-9)
+    offset = dy * c - dx * d
+    excess = max(abs(error) - NEAR_PATH, 0.0)
+    assert offset[0] == pytest.approx(math.copysign(excess, error))
+    if excess == 0.0:
+        for one, other in zip(led, path, strict=True):
+            np.testing.assert_array_equal(one, other)
+        return
+    assert (np.diff(np.abs(offset)) < 0.0).all()
+    slope = np.gradient(offset, path.arc_length)
+    tangent = np.tan(led.heading - path.heading)
+    np.testing.assert_allclose(tangent[1:-1], slope[1:-1], rtol=1e-3)
+    assert np.abs(slope).max() <= 0.4 + 1e-3
+    np.testing.assert_array_equal(led.speed, path.speed)
+    mirrored = local_reference(
+        observed(8.0, -0.02, 8.0)._replace(lateral_error=-error, longitudinal_speed=speed),
+        PERIOD, lengths, approaching=True,
+    )  # fmt: skip
+    np.testing.assert_allclose([mirrored.y, mirrored.heading], [-led.y, -led.heading], atol=1e-12)
 
 
 def test_points_between_behind_and_beyond():

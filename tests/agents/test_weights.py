@@ -1,6 +1,7 @@
 """Weights and schedules: validation, selection, blending, files."""
 
 import copy
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -19,7 +20,7 @@ from trajectories import CurvatureBands, load
 EDGES = (0.005, 0.02, 0.05)
 SETS = tuple(TrackingWeights(Q=(k, 1, 10, 10), S=(5, 5, 50, 50 * k)) for k in (1, 2, 3, 4))
 weight = st.floats(LOWEST, HIGHEST)
-weights = st.lists(weight, min_size=10, max_size=10).map(TrackingWeights.from_array)
+weights = st.lists(weight, min_size=12, max_size=12).map(TrackingWeights.from_array)
 
 
 def schedule(blend: float = 0.0, hysteresis: float = 0.2, **others: Any) -> WeightSchedule:
@@ -32,6 +33,8 @@ def schedule(blend: float = 0.0, hysteresis: float = 0.2, **others: Any) -> Weig
         ({"Q": (1, 1, 1)}, "Q must be 4 numbers"),
         ({"S": (1, 1, 1, 1, 1)}, "S must be 4 numbers"),
         ({"R": ()}, "R must be 2 numbers"),
+        ({"R_rate": (1, 1, 1)}, "R_rate must be 2 numbers"),
+        ({"R_rate": (-1, 1)}, r"R_rate\[0\] must be >= 0 and finite, not -1"),
         ({"Q": (1, -1e-9, 1, 1)}, r"Q\[1\] must be >= 0 and finite, not -1e-09"),
         ({"S": (1, 1, math.nan, 1)}, r"S\[2\] must be >= 0 and finite, not nan"),
         ({"R": (math.inf, 1)}, r"R\[0\] must be >= 0 and finite, not inf"),
@@ -42,25 +45,27 @@ def test_wrong_weights_are_refused(wrong: dict[str, Any], message: str) -> None:
         TrackingWeights(**wrong)
 
 
-@pytest.mark.parametrize("values", [[1.0] * 9, [1.0] * 11, np.ones((2, 5)), np.ones((10, 1)), 1.0])
+@pytest.mark.parametrize("values", [[1.0] * 10, [1.0] * 13, np.ones((2, 6)), np.ones((12, 1)), 1.0])
 def test_a_vector_of_another_shape_is_refused(values: Any) -> None:
-    with pytest.raises(ValueError, match="10 weights are needed"):
+    with pytest.raises(ValueError, match="12 weights are needed"):
         TrackingWeights.from_array(values)
 
 
 @given(weights)
 def test_array_round_trip(given_weights: TrackingWeights) -> None:
     array = given_weights.as_array()
-    assert array.shape == (10,)
+    assert array.shape == (12,)
     assert TrackingWeights.from_array(array) == given_weights
-    np.testing.assert_array_equal(array, [*given_weights.Q, *given_weights.S, *given_weights.R])
+    one = given_weights
+    np.testing.assert_array_equal(array, [*one.Q, *one.S, *one.R, *one.R_rate])
 
 
 def test_clipped_brings_every_weight_within_bounds() -> None:
-    wild = TrackingWeights(Q=(0, 1e12, 1, 1e-9), R=(1e7, 0))
+    wild = TrackingWeights(Q=(0, 1e12, 1, 1e-9), R=(1e7, 0), R_rate=(0, 1e9))
     clipped = wild.clipped()
     assert clipped.Q == (LOWEST, HIGHEST, 1.0, LOWEST)
     assert clipped.R == (HIGHEST, LOWEST)
+    assert clipped.R_rate == (LOWEST, HIGHEST)
     assert clipped.S == wild.S
     assert clipped.clipped() == clipped
 
@@ -72,7 +77,7 @@ def select(
     steps = len(curvature)
     rows = np.zeros((1, PREVIEW_START + 2 * steps))
     rows[0, PREVIEW_START : PREVIEW_START + steps] = curvature
-    bands, used = np.array([band]), np.zeros((1, 10))
+    bands, used = np.array([band]), np.zeros((1, 12))
     Switching(schedule, 0.05).choose(rows, steps, bands, used)
     return TrackingWeights.from_array(used[0]), int(bands[0])
 
@@ -89,7 +94,7 @@ def test_blended_is_the_geometric_mean(
 
 
 def test_half_way_between_1_and_100_is_10() -> None:
-    sets = tuple(TrackingWeights.from_array([value] * 10) for value in (1.0, 100.0))
+    sets = tuple(TrackingWeights.from_array([value] * 12) for value in (1.0, 100.0))
     blended = WeightSchedule(CurvatureBands((1.0,), ("low", "high")), sets, blend=0.5)
     np.testing.assert_allclose(select(blended, [1.0])[0].as_array(), 10.0)
 
@@ -214,13 +219,15 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path) -> None
 
 def content() -> dict[str, Any]:
     written: dict[str, Any] = {
-        "format": "weight-schedule/2",
+        "format": "weight-schedule/3",
         "bands": {
             "thresholds": list(EDGES),
             "names": ["straight", "gentle", "moderate", "sharp"],
             "hysteresis": 0.2,
         },
-        "weights": [{"Q": [*one.Q], "S": [*one.S], "R": [*one.R]} for one in SETS],
+        "weights": [
+            {"Q": [*one.Q], "S": [*one.S], "R": [*one.R], "R_rate": [*one.R_rate]} for one in SETS
+        ],
         "blend": 0.0,
         "slew": None,
         "provenance": {},
@@ -247,24 +254,47 @@ def test_the_content_below_is_one_that_is_read(tmp_path: Path) -> None:
     assert WeightSchedule.read(file) == schedule()
 
 
-def test_files_from_before_the_slew_limit_are_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", ["weight-schedule/1", "weight-schedule/2"])
+def test_files_of_earlier_formats_have_no_weight_on_rates(tmp_path: Path, form: str) -> None:
+    """The first format had no slew limit, either."""
     older = content()
-    older["format"] = "weight-schedule/1"
-    del older["slew"]
+    older["format"], older["slew"] = form, 4.0
+    if form == "weight-schedule/1":
+        del older["slew"]
+    for one in older["weights"]:
+        del one["R_rate"]
     file = tmp_path / "schedule.json"
     file.write_text(json.dumps(older))
+    sets = tuple(dataclasses.replace(one, R_rate=(0.0, 0.0)) for one in SETS)
+    slew = None if form == "weight-schedule/1" else 4.0
+    found = WeightSchedule.read(file)
+    assert found == dataclasses.replace(schedule(slew=slew), weights=sets)
+    assert found == weights_from(older)
+    # Once written anew, the file says so itself.
+    found.write(file)
+    assert WeightSchedule.read(file) == found
+    assert json.loads(file.read_text())["weights"][0]["R_rate"] == [0.0, 0.0]
+
+
+def test_a_set_without_weights_on_rates_has_the_default_ones(tmp_path: Path) -> None:
+    """In a file of the present format; one of an earlier format has none."""
+    shorter = content()
+    del shorter["weights"][0]["R_rate"]
+    file = tmp_path / "schedule.json"
+    file.write_text(json.dumps(shorter))
     assert WeightSchedule.read(file) == schedule()
 
 
 @pytest.mark.parametrize(
     ("place", "value", "reason"),
     [
-        (("format",), "weight-schedule/3", "format is 'weight-schedule/3'"),
+        (("format",), "weight-schedule/4", "format is 'weight-schedule/4'"),
         (("slew",), 0.0, "slew must be positive 1/s, not 0.0"),
         (("slew",), "fast", "could not convert"),
         (("weights", 0, "Q", 2), -1.0, "Q[2] must be >= 0 and finite"),
         (("weights", 1, "S"), [1.0], "S must be 4 numbers"),
         (("weights", 1, "R", 0), "heavy", "R[0] must be >= 0 and finite"),
+        (("weights", 2, "R_rate"), [1.0, -1.0], "R_rate[1] must be >= 0 and finite"),
         (("weights", 1, "R", 0), 10**400, "beyond 64 bits"),
         (("weights", 3, "Q", 0), math.inf, "Q[0] must be >= 0 and finite"),
         (("weights", 3), {"P": [1]}, "unexpected keyword argument 'P'"),
@@ -386,7 +416,7 @@ def test_weights_are_taken_as_they_are_from_a_file_or_typed(tmp_path: Path) -> N
     ("value", "reason"),
     [
         (7, "weights must be weights, a schedule or its file, not int"),
-        ({"P": [1]}, "unknown matrix of weights 'P'; known: Q, S, R"),
+        ({"P": [1]}, "unknown matrix of weights 'P'; known: Q, S, R, R_rate"),
         ({"Q": [1, 2]}, "Q must be 4 numbers"),
         ({"Q": 3}, "Q must be 4 numbers, each >= 0 and finite, not 3"),
         ({"Q": ["a", 1, 1, 1]}, r"Q\[0\] must be >= 0 and finite, not 'a'"),

@@ -72,7 +72,7 @@ def settings(rng: np.random.Generator) -> Settings:
         "conditions": CONDITIONS[rng.integers(len(CONDITIONS))],
         "control_period": period,
         "preview_steps": int(rng.integers(1, 30)),
-        "preview_period": None if rng.random() < 0.5 else float(rng.uniform(0.01, 0.2)),
+        "preview_period": 0.1 if rng.random() < 0.5 else float(rng.uniform(0.01, 0.2)),
         "max_lateral_error": float(rng.choice([0.5, 5.0, 1000.0])),
         "time_limit": None if rng.random() < 0.3 else float(rng.uniform(1.0, 30.0)),
         "initial_error_range": ERROR_RANGES[rng.integers(len(ERROR_RANGES))],

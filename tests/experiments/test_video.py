@@ -245,18 +245,19 @@ def test_a_window_shows_a_drive_and_its_end_does_not_end_it(
 def test_notes_hold_what_is_in_use_and_no_time() -> None:
     told = {
         "status": "SUCCESS", "iterations": 6, "seconds": 1.0, "fallback": "",
-        "weights": np.arange(10.0),
+        "weights": np.arange(12.0),
     }  # fmt: skip
     notes = agent_notes("mine", {"agent": told})
     assert notes["Q"].split() == ["0", "1", "2", "3"]
     assert notes["S"].split() == ["4", "5", "6", "7"]
     assert notes["R"].split() == ["8", "9"]
+    assert notes["R_rate"].split() == ["10", "11"]
     assert notes["agent"] == "mine"
     assert notes == agent_notes("mine", {"agent": {**told, "seconds": 2.0}})
     assert agent_notes("pid", {"agent": {}}) == {"agent": "pid"}
-    wide = [1e-4, 0.12345, 12.3, 123.4, 9999.0, 1e6, 0.0, 1.0, 0.01, 10.0]
+    wide = [1e-4, 0.12345, 12.3, 123.4, 9999.0, 1e6, 0.0, 1.0, 0.01, 10.0, 0.002, 0.2]
     assert " ".join(in_words(wide).values()).split() == [
-        "0.0001", "0.12", "12", "123", "9999", "1e+06", "0", "1", "0.01", "10"
+        "0.0001", "0.12", "12", "123", "9999", "1e+06", "0", "1", "0.01", "10", "0.002", "0.2"
     ]  # fmt: skip
 
 

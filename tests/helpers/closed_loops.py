@@ -40,7 +40,7 @@ def loop_of(n: int, settings: dict[str, Any], *, threads: int = 1, **more: Any) 
 
 def weights_of(n: int) -> Array:
     """A set for each environment."""
-    return WEIGHTS * 10.0 ** np.random.default_rng(0).uniform(-0.7, 0.7, (n, 10))
+    return WEIGHTS * 10.0 ** np.random.default_rng(0).uniform(-0.7, 0.7, (n, len(WEIGHTS)))
 
 
 def busy(env: PathTrackingVectorEnv) -> bool:

@@ -9,7 +9,7 @@ from agents.nmpc.problem import NmpcProblem
 from agents.weights import TrackingWeights
 
 Array = NDArray[np.float64]
-WEIGHTS = TrackingWeights(R_rate=(0.002, 0.2)).as_array()
+WEIGHTS = TrackingWeights().as_array()
 MIRROR_STATE = np.array([1.0, -1.0, -1.0, -1.0, 1.0, -1.0])
 MIRROR_INPUT = np.array([1.0, -1.0])
 MIRROR_OUTPUT = np.array([1.0, -1.0, 1.0, -1.0])

@@ -25,10 +25,11 @@ class StandIn:
         self.damping = (0.3, 0.2)
         self.iterations = iterations
 
-    def step(self, states: Array, inputs: Array) -> Array:
-        """Integrate states (6, n) with inputs (2, n) over one period."""
-        h, car = self.problem.period / self.problem.substeps[0], self.problem.vehicle
-        for _ in range(self.problem.substeps[0]):
+    def step(self, stage: int, states: Array, inputs: Array) -> Array:
+        """Integrate states (6, n) with inputs (2, n) over a stage."""
+        steps, car = self.problem.substeps[stage], self.problem.vehicle
+        h = self.problem.periods[stage] / steps
+        for _ in range(steps):
             k1 = derivative(states, inputs, car)
             k2 = derivative(states + h / 2 * k1, inputs, car)
             k3 = derivative(states + h / 2 * k2, inputs, car)
@@ -42,14 +43,14 @@ class StandIn:
         jacobians, rates, rate_jacobians = [], [], []
         moves = np.hstack([k * h * np.eye(8) for k in (-2, -1, 1, 2)])
         stencil = np.array([1.0, -8.0, 8.0, -1.0]) / (12 * h)
-        for u in inputs:
+        for stage, u in enumerate(inputs):
             z = np.concatenate([states[-1], u])[:, None] + moves
-            values = self.step(z[:6], z[6:]).reshape(6, 4, 8)
+            values = self.step(stage, z[:6], z[6:]).reshape(6, 4, 8)
             jacobians.append(np.einsum("ikj,k->ij", values, stencil))
             speeds = derivative(z[:6], z[6:], self.problem.vehicle)[0].reshape(4, 8)
             rate_jacobians.append(stencil @ speeds)
             rates.append(derivative(states[-1], u, self.problem.vehicle)[0])
-            states.append(self.step(states[-1][:, None], u[:, None])[:, 0])
+            states.append(self.step(stage, states[-1][:, None], u[:, None])[:, 0])
         jacobian, rate_jacobian = np.array(jacobians), np.array(rate_jacobians)
         return SimpleNamespace(
             states=np.array(states),
@@ -74,9 +75,9 @@ class StandIn:
             influence[i + 1] = along.A[i] @ influence[i]
             influence[i + 1][:, 2 * i : 2 * i + 2] = along.B[i]
         outputs = influence[1:][:, OUTPUTS].reshape(4 * n, 2 * n)
-        share = problem.period / NOMINAL_PERIOD
-        prices = np.concatenate([np.tile(share * weights[:4], n - 1), weights[4:8]])
-        effort = share * np.tile(weights[8:10], n)
+        shares = problem.periods / NOMINAL_PERIOD
+        prices = np.concatenate([np.outer(shares[1:], weights[:4]).ravel(), weights[4:8]])
+        effort = np.outer(shares, weights[8:10]).ravel()
         smooth = np.outer(1.0 / (problem.spacings * NOMINAL_PERIOD), weights[10:]).ravel()
         unit = np.eye(2 * n)
         change = unit - np.vstack([np.zeros((2, 2 * n)), unit[:-2]])
@@ -87,12 +88,12 @@ class StandIn:
         moves += change.T @ (smooth[:, None] * change)
         hessian = np.zeros((5 * n, 5 * n))
         hessian[: 2 * n, : 2 * n] = moves
-        hessian[2 * n :, 2 * n :] = share * np.diag(np.tile(problem.quadratic_penalty, n))
+        hessian[2 * n :, 2 * n :] = np.diag(np.outer(shares, problem.quadratic_penalty).ravel())
         effort_slope = effort * inputs.ravel() + change.T @ (smooth * (inputs - before).ravel())
         gradient = np.concatenate(
             [
                 effort_slope - outputs.T @ (prices * error),
-                share * np.tile(problem.linear_penalty, n),
+                np.outer(shares, problem.linear_penalty).ravel(),
             ]
         )
 
@@ -172,8 +173,8 @@ class HeldInput(StandIn):
         plan, warm = super().solve(state, last_input, reference, weights, warm)
         held = np.tile(last_input, (self.problem.horizon, 1))
         states = [state]
-        for u in held:
-            states.append(self.step(states[-1][:, None], u[:, None])[:, 0])
+        for stage, u in enumerate(held):
+            states.append(self.step(stage, states[-1][:, None], u[:, None])[:, 0])
         slack = np.zeros((len(held), 3))
         return plan._replace(
             status=Status.SUCCESS, inputs=held, states=np.array(states), slack=slack

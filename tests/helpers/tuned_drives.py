@@ -61,7 +61,7 @@ GROUPS = {"joint": JOINT, "stages": STAGES, "all": [[j] for j in range(8)]}
 
 
 def meant(choice: WeightChoice, action: Any, band: int) -> Array:
-    """Set (10,) that an action asks for in a band."""
+    """Set (12,) that an action asks for in a band."""
     if choice.catalogue:
         return choice.catalogue[int(action)].as_array()
     wanted = choice.schedule.weights[band].as_array()

@@ -9,7 +9,7 @@ import numpy as np
 from agents.weight_tuning.choice import DIRECTIONS, WeightChoice
 from agents.weight_tuning.features import size
 from agents.weight_tuning.policy import WeightPolicy
-from agents.weights import TrackingWeights, WeightSchedule
+from agents.weights import WEIGHTS, TrackingWeights, WeightSchedule
 from lpv_track_env.observation import ObservationLayout
 from trajectories import CurvatureBands
 
@@ -21,7 +21,7 @@ TRAINING: dict[str, Any] = {
 
 def random_weights(rng: np.random.Generator) -> TrackingWeights:
     """Weights within their bounds, over six decades."""
-    return TrackingWeights.from_array(10.0 ** rng.uniform(-3.0, 3.0, 10))
+    return TrackingWeights.from_array(10.0 ** rng.uniform(-3.0, 3.0, WEIGHTS))
 
 
 def random_weight_choice(seed: int = 0, catalogue: bool = False) -> WeightChoice:

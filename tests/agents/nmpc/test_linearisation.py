@@ -1,16 +1,19 @@
 """The NMPC's discrete model and its derivatives, compiled, against CasADi's and by hand."""
 
+import math
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 
-from agents.nmpc.linearisation import Linearisation
+from agents.nmpc.linearisation import RESOLVED, Linearisation, substeps
 from agents.nmpc.problem import NmpcProblem
 from agents.nmpc.rti_solver import RtiSolver
 from experiments.run.suites import PAPER_VEHICLES
 from experiments.verify.bench import scaled_error
 from experiments.verify.oracles import CasadiDerivatives, rolled_out
-from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
+from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, derivative, fastest_pole
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES, VehicleParameters
 from tests.helpers.nmpc_situations import MIRROR_INPUT, MIRROR_STATE
 
@@ -94,6 +97,52 @@ def test_roll_out_is_runge_kuttas_in_numpy(car: VehicleParameters, period: float
         ours, theirs = solver.linearise(state, inputs).states, rolled_out(problem, state, inputs)
         np.testing.assert_array_equal(ours[0], state)
         assert scaled_error(ours, theirs) <= 1e-9
+
+
+SPEEDS = (0.0, 0.05, 0.3, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 30.0)
+
+
+@pytest.mark.parametrize("length", [0.02, 0.1, 0.3])
+@each_vehicle
+def test_steps_by_speed_resolve_the_lateral_poles(car: VehicleParameters, length: float) -> None:
+    """At any speed from standstill on, by at most one step more than that takes."""
+    constants = RtiSolver(NmpcProblem(car, 1, length), steps_by_speed=True).constants
+    for speed in SPEEDS:
+        n = substeps(speed, 0.0, length, 1.0, constants)
+        # Poles fall as 1 / vx only nearly: at 30 m/s they are up to 30 % faster than that.
+        product = length * fastest_pole(speed, car)
+        assert product / n <= (1.3 if speed > 15.0 else 1.01) * RESOLVED
+        assert n <= math.ceil(product / RESOLVED) + 1
+        # Braking: those of the lowest speed, at least standstill.
+        for a in (-2.0, 2.0):
+            slowest = max(speed - 2.0 * length, 0.0)
+            assert substeps(speed, a, length, 1.0, constants) == substeps(
+                slowest, 0.0, length, 1.0, constants
+            )
+
+
+@each_vehicle
+def test_steps_by_speed_are_near_the_exact_flow(car: VehicleParameters) -> None:
+    """After a stage of 0.1 s, from standstill to 30 m/s, in turns of up to 1 g."""
+    length = 0.1
+    solver = RtiSolver(NmpcProblem(car, 1, length), steps_by_speed=True)
+    rng = np.random.default_rng(4)
+    for speed in SPEEDS:
+        for state in random_states(rng, 10, (speed, speed)):
+            inputs, sharpest = random_inputs(rng, 1, car), 9.81 / max(speed, 0.1) ** 2
+            inputs[:, 1] *= min(car.wheelbase * sharpest / (np.pi / 6), 1.0)
+            state[YAW_RATE] *= min(speed * sharpest, 1.0)
+            # A vehicle does not brake into reverse.
+            inputs[0, 0] = max(inputs[0, 0], -0.9 * speed / length)
+            exact = solve_ivp(
+                lambda _, z, u=inputs[0]: derivative(z, u, car), (0.0, length), state,
+                method="DOP853", rtol=1e-10, atol=1e-12,
+            ).y[:, -1]  # fmt: skip
+            error = np.abs(solver.linearise(state, inputs).states[1] - exact)
+            # A centimetre, a hundredth of a radian of heading and of direction of travel (0.1 m/s
+            # at 10 m/s and below), 0.1 m/s, 0.1 rad/s.
+            limits = np.array([0.1, 0.01 * max(speed, 10.0), 0.01, 0.1, 0.01, 0.01])
+            assert (error <= limits).all(), (state, inputs, error)
 
 
 def test_straight_ahead_by_hand() -> None:

@@ -57,7 +57,7 @@ def random_situation(rng: np.random.Generator, problem: NmpcProblem) -> tuple[Ar
         ]
     )
     last = np.array([0.2, problem.vehicle.wheelbase * curvature])
-    s = speed * problem.period * np.arange(n + 1)
+    s = speed * problem.times
     heading = curvature * s
     x = np.sin(heading) / curvature
     y = (1 - np.cos(heading)) / curvature
@@ -67,6 +67,13 @@ def random_situation(rng: np.random.Generator, problem: NmpcProblem) -> tuple[Ar
 @pytest.fixture(scope="module")
 def solver() -> IpoptSolver:
     return IpoptSolver(NmpcProblem(M2_MINIBUS, horizon=20, period=0.05), tolerance=1e-9)
+
+
+@pytest.fixture(scope="module")
+def uneven() -> IpoptSolver:
+    stages = tuple(np.linspace(0.03, 0.15, 12))
+    problem = NmpcProblem(M2_MINIBUS, horizon=12, stages=stages, first_period=0.05)
+    return IpoptSolver(problem, tolerance=1e-9)
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=list(VEHICLES))
@@ -81,7 +88,7 @@ def test_discrete_model_is_the_plants_field(vehicle: VehicleParameters, period: 
         )
         u = np.array([rng.uniform(-4, 2), rng.uniform(-0.5, 0.5)])
         mine = np.asarray(model(x, u)).ravel()
-        same = runge_kutta(x, u, vehicle, period, problem.substeps)
+        same = runge_kutta(x, u, vehicle, period, problem.substeps[0])
         np.testing.assert_allclose(mine, same, rtol=1e-10, atol=1e-11)
 
 
@@ -103,13 +110,17 @@ def test_discrete_model_is_near_the_exact_flow_at_speed() -> None:
 def test_substeps_follow_the_stiffness() -> None:
     # Largest real pole at 1 m/s: 68/s for the minibus, 132/s for the course car; RK4 needs 2.78.
     counts = {
-        vehicle.name: [NmpcProblem(vehicle, period=period).substeps for period in (0.02, 0.05, 0.1)]
+        vehicle.name: NmpcProblem(vehicle, 3, stages=(0.02, 0.05, 0.1)).substeps.tolist()
         for vehicle in (M2_MINIBUS, COURSE_CAR)
     }
     assert counts == {"m2-minibus": [1, 2, 3], "course-car": [1, 3, 5]}
 
 
-def test_plan_keeps_every_constraint_and_the_dynamics(solver: IpoptSolver) -> None:
+@pytest.mark.parametrize("stages", ["solver", "uneven"])
+def test_plan_keeps_every_constraint_and_the_dynamics(
+    stages: str, request: pytest.FixtureRequest
+) -> None:
+    solver = request.getfixturevalue(stages)
     problem, rng = solver.problem, np.random.default_rng(1)
     car = problem.vehicle
     for _ in range(10):
@@ -120,7 +131,8 @@ def test_plan_keeps_every_constraint_and_the_dynamics(solver: IpoptSolver) -> No
         assert solution.states is not None
         assert solution.slack is not None
         for k, u in enumerate(solution.inputs):
-            following = runge_kutta(solution.states[k], u, car, problem.period, problem.substeps)
+            length, steps = problem.periods[k], problem.substeps[k]
+            following = runge_kutta(solution.states[k], u, car, length, steps)
             np.testing.assert_allclose(solution.states[k + 1], following, atol=1e-7)
         low, high = problem.input_bounds
         assert (solution.inputs >= low - 1e-8).all()
@@ -143,26 +155,32 @@ def test_plan_keeps_every_constraint_and_the_dynamics(solver: IpoptSolver) -> No
 
 def test_optimum_equals_single_shooting_by_another_solver() -> None:
     """SciPy's SLSQP on inputs alone, with NumPy's dynamics, finds the same plan."""
-    problem = NmpcProblem(M2_MINIBUS, horizon=5, period=0.1)
+    stages = (0.05, 0.1, 0.1, 0.15, 0.1)
+    problem = NmpcProblem(M2_MINIBUS, horizon=5, stages=stages, first_period=0.04)
     solver, rng = IpoptSolver(problem, tolerance=1e-10), np.random.default_rng(2)
-    q, s, r = WEIGHTS[:4], WEIGHTS[4:8], WEIGHTS[8:]
+    q, s, r, r_rate = np.split(WEIGHTS, (4, 8, 10))
+    # From the middle of an input to that of the next one, s.
+    apart = (0.045, 0.075, 0.1, 0.125, 0.125)
     for _ in range(5):
         state, last, reference = random_situation(rng, problem)
 
-        def cost(flat: Array, state: Array = state, reference: Array = reference) -> float:
-            x, total = state, 0.0
+        def cost(
+            flat: Array, state: Array = state, last: Array = last, reference: Array = reference
+        ) -> float:
+            x, before, total = state, last, 0.0
             for k, u in enumerate(flat.reshape(-1, 2)):
-                error = reference[k] - x[[0, 2, 4, 5]]
-                total += 0.5 * (q @ error**2 + r @ u**2)
-                x = runge_kutta(x, u, M2_MINIBUS, problem.period, problem.substeps)
+                error, rate = reference[k] - x[[0, 2, 4, 5]], (u - before) / apart[k]
+                total += 0.5 * stages[k] / 0.05 * (q @ error**2 + r @ u**2)
+                total += 0.5 * apart[k] / 0.05 * (r_rate @ rate**2)
+                x, before = runge_kutta(x, u, M2_MINIBUS, stages[k], problem.substeps[k]), u
             error = reference[-1] - x[[0, 2, 4, 5]]
             return float(total + 0.5 * s @ error**2)
 
         def margins(flat: Array, last: Array = last) -> Array:
             steps = np.diff(np.vstack([last, flat.reshape(-1, 2)]), axis=0)
-            return np.concatenate(
-                [(problem.input_steps - steps).ravel(), (problem.input_steps + steps).ravel()]
-            )
+            car, times = M2_MINIBUS, (0.04, *apart[1:])
+            most = np.outer(times, [car.max_jerk, car.max_steering_rate])
+            return np.concatenate([(most - steps).ravel(), (most + steps).ravel()])
 
         low, high = problem.input_bounds
         other = minimize(
@@ -190,7 +208,11 @@ def test_warm_start_changes_the_work_not_the_answer(solver: IpoptSolver) -> None
     assert again.iterations < cold.iterations
 
 
-def test_mirrored_problem_has_the_mirrored_plan(solver: IpoptSolver) -> None:
+@pytest.mark.parametrize("stages", ["solver", "uneven"])
+def test_mirrored_problem_has_the_mirrored_plan(
+    stages: str, request: pytest.FixtureRequest
+) -> None:
+    solver = request.getfixturevalue(stages)
     state, last, reference = random_situation(np.random.default_rng(4), solver.problem)
     left, _ = solver.solve(state, last, reference, WEIGHTS)
     flip = np.array([1, -1, -1, -1, 1, -1])
@@ -205,10 +227,26 @@ def test_weights_are_parameters(solver: IpoptSolver) -> None:
     state, last, reference = random_situation(np.random.default_rng(5), solver.problem)
     state[5] = 0.5
     base, _ = solver.solve(state, last, reference, WEIGHTS)
-    lazy, _ = solver.solve(state, last, reference, WEIGHTS * np.array([1] * 9 + [1000]))
+    lazy, _ = solver.solve(state, last, reference, WEIGHTS * np.array([1] * 9 + [1000, 1, 1]))
     assert base.inputs is not None
     assert lazy.inputs is not None
     assert np.abs(lazy.inputs[:, 1]).max() < 0.5 * np.abs(base.inputs[:, 1]).max()
+
+
+def test_a_weight_on_rates_smooths_the_inputs(solver: IpoptSolver) -> None:
+    state, last, reference = random_situation(np.random.default_rng(5), solver.problem)
+    state[5] = 0.5
+    for k in range(2):
+        largest = []
+        for rate in (0.0, 1.0, 100.0):
+            weights = WEIGHTS.copy()
+            weights[10 + k] = rate
+            solution, _ = solver.solve(state, last, reference, weights)
+            assert solution.inputs is not None
+            steps = np.diff([last[k], *solution.inputs[:, k]])
+            largest.append(float(np.sum(steps**2)))
+        assert largest == sorted(largest, reverse=True)
+        assert largest[2] < 0.1 * largest[0]
 
 
 def test_impossible_curvature_is_slack_not_failure() -> None:
@@ -237,7 +275,7 @@ def test_bad_settings_are_refused() -> None:
     env = gymnasium.make(ID, trajectory="straight")
     for name in NAMES:
         with pytest.raises(ValueError, match="preview_steps=30"):
-            agents.make(name, env, horizon=30)
+            agents.make(name, env, stages=0.1, horizon=30)
         with pytest.raises(ValueError, match="selection"):
             agents.make(name, env, selection="psychic")
     with pytest.raises(ValueError, match=r"damping\[0\] must be >= 0 and at most 1e\+09"):
@@ -267,6 +305,12 @@ def planned_inputs(memory: Any) -> Array:
     """Inputs (N, 2) of the last plan of the one vehicle that either agent remembers."""
     plan: Array = memory.plans[0] if hasattr(memory, "plans") else memory[0].plan
     return plan.copy()
+
+
+def stage_after(periods: int, agent: Any) -> int:
+    """Stage of a plan that is under way some control periods of 0.05 s after it was made."""
+    begun: int = np.count_nonzero(agent.problem.times <= 0.05 * periods + 1e-9)
+    return begun - 1
 
 
 def counts(memory: Any) -> dict[str, int]:
@@ -307,7 +351,7 @@ def test_fallbacks(nmpc: tuple[gymnasium.Env, Any]) -> None:
         assert report["plan"] is None
         assert report["slack"] is None
         if report["fallback"] == "plan":
-            np.testing.assert_allclose(action, plan[k + 1], atol=1e-6)
+            np.testing.assert_allclose(action, plan[stage_after(k + 1, agent)], atol=1e-6)
     assert seen == ["plan"] * 4 + ["stop"] * 2
     assert counts(memory) == {"NAN": 6, "plan": 4, "stop": 2}
     # A solve that succeeds ends it, and the failures are counted from anew.
@@ -332,12 +376,15 @@ def test_the_solve_after_a_failed_one_begins_cold(nmpc: tuple[gymnasium.Env, Any
     for _ in range(20):
         start = np.array([len(rows) == 1])
         rows.append(env.step(agent.predict(rows[-1], episode_start=start)[0])[0])
-    warm, _ = agent.predict(rows[-1])
-    cold, _ = agent.predict(rows[-1], episode_start=np.array([True]))
+    warm = planned_inputs(agent.predict(rows[-1])[1])
+    action, memory = agent.predict(rows[-1], episode_start=np.array([True]))
+    cold = planned_inputs(memory)
     assert not np.array_equal(warm, cold)
     agent.predict(rows[-3], episode_start=np.array([True]))
     agent.predict(np.where(np.arange(len(rows[-2])) == 5, np.nan, rows[-2]))
-    np.testing.assert_array_equal(agent.predict(rows[-1])[0], cold)
+    again, memory = agent.predict(rows[-1])
+    np.testing.assert_array_equal(again, action)
+    np.testing.assert_array_equal(planned_inputs(memory), cold)
 
 
 def test_a_plan_that_is_used_up_is_followed_by_stanley() -> None:
@@ -349,10 +396,11 @@ def test_a_plan_that_is_used_up_is_followed_by_stanley() -> None:
         lost[0] = np.nan
         agent.predict(observation)
         seen = []
-        for _ in range(4):
+        for _ in range(7):
             _, memory = agent.predict(lost)
             seen.append(agent.diagnostics(memory[0])["fallback"])
-        assert seen == ["plan", "plan", "stanley", "stanley"], name
+        # 0.3 s are six control periods, of which the solve has had the first.
+        assert seen == ["plan"] * 5 + ["stanley"] * 2, name
 
 
 def test_fallbacks_when_solves_fail(
@@ -371,7 +419,7 @@ def test_fallbacks_when_solves_fail(
         assert report["status"] == "INFEASIBLE"
         seen.append(report["fallback"])
         if report["fallback"] == "plan":
-            np.testing.assert_allclose(action, plan[k + 1], atol=1e-6)
+            np.testing.assert_allclose(action, plan[stage_after(k + 1, agent)], atol=1e-6)
         if report["fallback"] == "stop":
             assert action[0] < 0
     assert seen == ["plan"] * 4 + ["stop"] * 2
@@ -399,7 +447,7 @@ def test_solver_that_raises_is_a_failure_with_a_status(
 
 
 @pytest.mark.parametrize(
-    "weights", [[1.0] * 9, [np.nan] * 10, [-1.0] * 10, [np.inf] * 10, "heavy"], ids=str
+    "weights", [[1.0] * 10, [np.nan] * 12, [-1.0] * 12, [np.inf] * 12, "heavy"], ids=str
 )
 def test_bad_weights_are_refused_and_counted(
     nmpc: tuple[gymnasium.Env, Any], weights: object
@@ -415,7 +463,7 @@ def test_huge_weights_are_clipped(nmpc: tuple[gymnasium.Env, Any]) -> None:
     _, agent = nmpc
     before = agent.fixed_weights[0].copy()
     try:
-        assert agent.set_weights([1e12] * 10)
+        assert agent.set_weights([1e12] * 12)
         assert (agent.fixed_weights == 1e6).all()
     finally:
         assert agent.set_weights(before)

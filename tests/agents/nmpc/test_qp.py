@@ -6,11 +6,10 @@ from numpy.typing import NDArray
 
 from agents.nmpc.problem import NmpcProblem, Status
 from agents.nmpc.rti_solver import RtiSolver
-from agents.weights import TrackingWeights
 from experiments.verify.oracles import CasadiDerivatives, PiqpOracle
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES, VehicleParameters
 from tests.helpers.condensed_qp import CondensedQp, excess, within
-from tests.helpers.nmpc_situations import MIRROR_INPUT, Situation, arc, hard
+from tests.helpers.nmpc_situations import MIRROR_INPUT, WEIGHTS, Situation, arc, hard
 
 Array = NDArray[np.float64]
 
@@ -186,7 +185,7 @@ def test_first_period_bounds_the_first_change() -> None:
         last = np.array([0.2, 0.0])
         reference = arc(0.0, np.full(11, 12.0), 0.05)
         _, found = RtiSolver(problem).solve_qp(
-            state, last, reference, TrackingWeights().as_array(), np.tile(last, (10, 1))
+            state, last, reference, WEIGHTS, np.tile(last, (10, 1))
         )
         first, second = found[0] - last, found[1] - found[0]
         rates = np.array([M2_MINIBUS.max_jerk, -M2_MINIBUS.max_steering_rate])

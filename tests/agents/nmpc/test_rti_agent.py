@@ -2,12 +2,14 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import numba
 import numpy as np
 import pytest
 
-from agents.nmpc import rti
+import agents
+from agents.nmpc import layout, rti
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.observation import PREVIEW_START
 from tests.helpers.driven_vehicles import drives, environment, made
@@ -175,7 +177,7 @@ def test_diagnostics_of_a_row() -> None:
         wanted, report = single.diagnostics(alone[0]), agent.diagnostics(memory[k])
         assert report.keys() == wanted.keys()
         assert report["status"] == "SUCCESS"
-        assert report["plan"].shape == (21, 2)
+        assert report["plan"].shape == (16, 2)
         # The plan begins where the vehicle is, in the frame of the path's foot point.
         np.testing.assert_allclose(report["plan"][0], [0.0, rows[-1][k][5]])
         assert report["slack"].shape == (3,)
@@ -250,10 +252,10 @@ def test_schedule_by_band_chooses_for_every_row() -> None:
 
 
 def test_control_period_shorter_than_the_previews() -> None:
-    """It plans on periods of 0.1 s, acts every 0.05 s, and moves its plan on by halves."""
+    """It plans on stages of 0.1 s, acts every 0.05 s, and moves its plan on by halves."""
     env = environment(control_period=0.05, preview_period=0.1, preview_steps=15)
-    agent = made(env)
-    assert agent.problem.period == 0.1
+    agent = made(env, stages=0.1)
+    np.testing.assert_array_equal(agent.problem.periods, [0.1] * 15)
     np.testing.assert_allclose(
         agent.problem.input_steps[:2, 0], agent.problem.vehicle.max_jerk * np.array([0.05, 0.1])
     )
@@ -269,7 +271,7 @@ def test_control_period_shorter_than_the_previews() -> None:
     assert info["end"] == "finished"
     assert max(lateral) < 0.05
     assert clipped == 0
-    # Blind, it follows its last plan: each of its periods lasts two steps.
+    # Blind, it follows its last plan: each of its stages lasts two steps.
     env.reset(options={"arc_length": 40.0})
     observation, _ = env.reset(options={"arc_length": 40.0, "lateral_error": 0.3})
     _, memory = agent.predict(observation, None, BEGIN)
@@ -279,13 +281,93 @@ def test_control_period_shorter_than_the_previews() -> None:
     np.testing.assert_allclose(followed, plan[[0, 1, 1, 2]], rtol=1e-6)
 
 
+UNEVEN = (0.03, 0.05, 0.05, *[0.1] * 5, 0.2, 0.3, 0.4)
+"""Stages of 1.53 s, s."""
+
+
+def test_stages_of_any_length() -> None:
+    """They drive as the default ones do; a lost observation's action is that of its time."""
+    env = environment()
+    agent = made(env, stages=UNEVEN)
+    observation, info = env.reset(seed=0)
+    lateral, done = [], False
+    while not done:
+        action, memory = agent.predict(observation)
+        assert agent.diagnostics(memory[0])["status"] == "SUCCESS"
+        assert agent.diagnostics(memory[0])["plan"].shape == (12, 2)
+        observation, _, terminated, truncated, info = env.step(action)
+        lateral.append(abs(info["lateral_error"]))
+        done = terminated or truncated
+    assert info["end"] == "finished"
+    assert max(lateral) < 0.05
+    observation, _ = env.reset(options={"arc_length": 40.0, "lateral_error": 0.3})
+    _, memory = agent.predict(observation, None, BEGIN)
+    plan, lost = memory.plans[0].copy(), observation.copy()
+    lost[5] = np.nan
+    # At 0.05, 0.1, ... s; stages begin at 0, 0.03, 0.08, 0.13, 0.23, ... s.
+    followed = [agent.predict(lost)[0] for _ in range(6)]
+    np.testing.assert_allclose(followed, plan[[1, 2, 3, 3, 4, 4]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("settings", [{}, {"stages": UNEVEN}], ids=str)
+def test_the_compiled_problem_is_that_of_the_situation(settings: dict[str, Any]) -> None:
+    """State and reference of a solve, which the solvers by CasADi get from Python."""
+    agent = made(**settings)
+    stages = layout.working_space(agent.problem.horizon, 1)[0][0]
+    for row in drives(17, 1)[0].astype(np.float64):
+        for lateral in (row[5], 1.7, -6.0):
+            row[5] = lateral
+            state, _, reference = agent.situation(agent.task.layout.unpack(row))
+            assert rti.load_observation(row, agent.solver.constants, stages)
+            found = stages[:, layout.REFERENCE : layout.REFERENCE_Y + 1]
+            np.testing.assert_allclose(found, reference, atol=1e-12)
+            np.testing.assert_array_equal(stages[0, layout.PLAN_VX : layout.PLAN_Y + 1], state)
+
+
+def test_mirrored_observations_have_mirrored_actions() -> None:
+    rows = drives(17, 2)
+    sign = np.concatenate([[1, -1, -1, 1, -1, -1, -1, 1], -np.ones(20), np.ones(20)])
+    for settings in ({}, {"stages": UNEVEN}):
+        left, right = made(**settings), made(**settings)
+        for row in rows:
+            mirrored = right.predict(row * sign.astype(np.float32))[0]
+            np.testing.assert_allclose(mirrored, left.predict(row)[0] * [1, -1], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("stages", "nodes"),
+    [
+        (None, 20), ((0.2,) * 10, 20), ((0.05,) * 40, 20), ((0.05,) * 10, 5), ((0.3,) * 4, 12),
+        ((0.1, 0.02), 2), ((0.25,), 3), (UNEVEN, 16),
+    ],
+    ids=repr,
+)  # fmt: skip
+@pytest.mark.parametrize("name", ["lpv-nmpc", "lpv-nmpc-tuned"])
+def test_bands_are_chosen_by_the_preview_that_the_stages_reach(
+    name: str, stages: tuple[float, ...] | None, nodes: int
+) -> None:
+    schedule = WeightSchedule(
+        CurvatureBands((0.05,), ("straight", "sharp")),
+        (TrackingWeights(), TrackingWeights(R=(0.01, 5.0))),
+    )
+    env = environment(trajectory="straight")
+    agent = agents.make(name, env, stages=stages, weights=schedule)
+    observation, _ = env.reset(seed=0)
+    for k in range(20):
+        row = observation.copy()
+        row[PREVIEW_START + k] = 0.1
+        _, memory = agent.predict(row, episode_start=BEGIN)
+        in_use = agent.diagnostics(memory[0])["weights"]
+        np.testing.assert_array_equal(in_use, schedule.weights[k < nodes].as_array())
+
+
 def test_horizon_shorter_than_the_preview() -> None:
-    rows, agent = drives(3, 1)[0], made(horizon=7)
+    rows, agent = drives(3, 1)[0], made(stages=0.1, horizon=7)
     _, memory = agent.predict(rows)
     assert agent.diagnostics(memory[0])["plan"].shape == (8, 2)
     # What lies beyond the horizon is not looked at.
     changed = rows.copy()
     changed[:, PREVIEW_START + 7 : PREVIEW_START + 20] = 0.1
     np.testing.assert_array_equal(
-        made(horizon=7).predict(changed)[0], made(horizon=7).predict(rows)[0]
+        *(made(stages=0.1, horizon=7).predict(seen)[0] for seen in (changed, rows))
     )

@@ -58,7 +58,7 @@ def test_nothing_of_a_wild_batch_stays_in_the_solver() -> None:
 def test_actions_on_the_way_to_bounds_lie_in_the_action_space() -> None:
     """The bounds are float32's: rounding to it must not step over them."""
     env = environment()
-    agent = made(env, weights=TrackingWeights.from_array(WEIGHTS * ([100.0] * 8 + [1e-3, 1e-3])))
+    agent = made(env, weights=TrackingWeights.from_array(WEIGHTS * ([100.0] * 8 + [1e-3] * 4)))
     observation, _ = env.reset(options={"lateral_error": 3.0})
     rows = np.repeat(observation[None], 200, axis=0)
     rng = np.random.default_rng(7)

@@ -1,5 +1,7 @@
 """The real-time solver as a solver: statuses, warm starts, and the optimum it iterates towards."""
 
+import itertools
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -45,7 +47,8 @@ def solved(solution: Solution) -> tuple[Array, Array, Array]:
 @each_vehicle
 def test_iterated_it_converges_to_ipopts_optimum(car: VehicleParameters) -> None:
     """Costs agree to 1e-6 where both find the same of several optima; and IPOPT keeps our plan."""
-    problem = NmpcProblem(car, horizon=15, first_period=0.03)
+    stages = tuple(np.linspace(0.04, 0.11, 15))
+    problem = NmpcProblem(car, horizon=15, stages=stages, first_period=0.03)
     ours, ipopt = RtiSolver(problem, iterations=CONVERGED), IpoptSolver(problem, tolerance=1e-9)
     same = 0
     for case in [*cases(5, problem), *cases(5, problem, decades=0.0, errors=0.3)]:
@@ -87,7 +90,8 @@ def test_a_warm_start_is_nearer_to_the_same_optimum() -> None:
 
 @pytest.mark.parametrize("n", [1, 5, 20, 50])
 def test_one_iteration_is_one_program_along_the_shifted_plan(n: int) -> None:
-    problem = NmpcProblem(COURSE_CAR, horizon=n, period=0.05, first_period=0.03)
+    stages = tuple(0.05 + 0.03 * np.sin(5.0 * np.arange(n)))
+    problem = NmpcProblem(COURSE_CAR, horizon=n, stages=stages, first_period=0.03)
     solver = RtiSolver(problem)
     for case in cases(5, problem):
         state, last, reference, weights = case.parameters
@@ -100,9 +104,9 @@ def test_one_iteration_is_one_program_along_the_shifted_plan(n: int) -> None:
         handed = plan.copy()
         warm, _ = solver.solve(*case.parameters, handed)
         np.testing.assert_array_equal(handed, plan)
-        # 0.03 s on of periods of 0.05 s; the last input is held.
+        # 0.03 s on of stages of 0.02 to 0.08 s; the last input is held.
         moved = plan.copy()
-        moved[:-1] += 0.6 * np.diff(plan, axis=0)
+        moved[:-1] += np.minimum(0.03 / problem.periods[:-1, None], 1.0) * np.diff(plan, axis=0)
         # It starts from the input in force, not from where the plan thought to be.
         low, high = problem.input_bounds
         before = last
@@ -116,7 +120,7 @@ def test_one_iteration_is_one_program_along_the_shifted_plan(n: int) -> None:
 @each_vehicle
 def test_plans_keep_the_hard_limits_and_are_priced_as_predicted(car: VehicleParameters) -> None:
     problem = NmpcProblem(
-        car, horizon=20, first_period=0.03,
+        car, horizon=20, first_period=0.03, stages=tuple(np.linspace(0.04, 0.11, 20)),
         linear_penalty=(20.0, 15.0, 25.0), quadratic_penalty=(100.0, 80.0, 120.0),
     )  # fmt: skip
     solver = RtiSolver(problem)
@@ -182,6 +186,36 @@ def test_arguments_may_be_views_and_are_left_alone() -> None:
         np.testing.assert_array_equal(value, copy)
 
 
+# Stages of any length and number ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("car", [M2_MINIBUS, COURSE_CAR], ids=lambda car: car.name)
+def test_weights_mean_the_same_at_twice_as_many_stages(car: VehicleParameters) -> None:
+    """Stages, equal or not, are a grid on a plan over time: costs converge as they shrink."""
+    state, last = np.array([6.3, 0.0, 0.05, 0.2, 0.0, 0.3]), np.array([0.2, 0.1])
+    coarsest = np.linspace(0.06, 0.16, 20)
+    plans, costs, ends = [], [], []
+    for parts in (1, 2, 4):
+        stages = np.repeat(coarsest, parts) / parts
+        n = len(stages)
+        problem = NmpcProblem(car, horizon=n, stages=tuple(stages), first_period=0.05)
+        reference = arc(0.04, np.full(n + 1, 6.0), stages)
+        solver = RtiSolver(problem, iterations=CONVERGED)
+        solution, _ = solver.solve(state, last, reference, WEIGHTS)
+        inputs, states, _ = solved(solution)
+        plans.append(inputs.reshape(20, parts, 2).mean(axis=1))
+        costs.append(solution.cost)
+        ends.append(states[-1])
+    # Sums over rectangles: of first order, so the error is halved with the stages.
+    changes = np.abs(np.diff(costs))
+    assert changes[1] == pytest.approx(0.5 * changes[0], rel=0.3)
+    assert costs[2] == pytest.approx(costs[1], rel=0.05)
+    np.testing.assert_allclose(ends[1:], ends[:2], atol=0.03)
+    for fine, coarse in itertools.pairwise(reversed(plans)):
+        np.testing.assert_allclose(coarse[:, 0], fine[:, 0], atol=0.15)
+        np.testing.assert_allclose(coarse[:, 1], fine[:, 1], atol=0.02)
+
+
 # What goes wrong -----------------------------------------------------------------------------
 
 
@@ -239,7 +273,7 @@ def test_a_failed_solve_leaves_no_trace() -> None:
 def test_last_input_out_of_bounds_is_brought_within() -> None:
     problem = NmpcProblem(M2_MINIBUS)
     state = np.array([8.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    reference = arc(0.0, np.full(21, 8.0), 0.05)
+    reference = arc(0.0, np.full(21, 8.0), problem.periods)
     low, high = problem.input_bounds
     solver = RtiSolver(problem)
     for over, at in ((high + 1.0, high), (low - 1.0, low)):

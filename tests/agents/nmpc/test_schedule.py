@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.nmpc.schedule import NO_BAND, WEIGHTS, Switching
-from agents.weights import HIGHEST, LOWEST, TrackingWeights, WeightSchedule
+from agents.nmpc.schedule import NO_BAND, Switching
+from agents.weights import HIGHEST, LOWEST, WEIGHTS, TrackingWeights, WeightSchedule
 from lpv_track_env.observation import PREVIEW_START
 from trajectories import CurvatureBands
 
 STEPS = 5
 weight = st.floats(LOWEST, HIGHEST)
-sets = st.lists(weight, min_size=10, max_size=10).map(TrackingWeights.from_array)
+sets = st.lists(weight, min_size=WEIGHTS, max_size=WEIGHTS).map(TrackingWeights.from_array)
 previews = st.lists(st.floats(-0.08, 0.08), min_size=STEPS, max_size=STEPS)
 
 
@@ -39,7 +39,7 @@ class Follower:
 def plain_select(
     schedule: WeightSchedule, curvature: list[float], band: int | None
 ) -> tuple[np.ndarray, int]:
-    """Weights (10,) and band for a preview of curvature, written once more without compilation."""
+    """Weights (12,) and band for a preview of curvature, written once more without compilation."""
     chosen = schedule.bands.select(curvature, band)
     rows = [weights.clipped().as_array() for weights in schedule.weights]
     if schedule.blend == 0.0:

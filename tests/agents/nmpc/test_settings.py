@@ -8,7 +8,7 @@ import pytest
 
 import agents
 from agents.base import DrivingTask
-from agents.nmpc.base import NmpcSettings
+from agents.nmpc.base import GROWTH, NmpcSettings, stages_of
 from agents.nmpc.frozen import FrozenLpvMpc
 from agents.nmpc.ipopt_agent import IpoptNmpc
 from agents.nmpc.rti_agent import RtiNmpc
@@ -16,6 +16,7 @@ from agents.registry import agent_class
 from agents.weight_tuning.agent import TunedNmpc
 from agents.weights import TrackingWeights, WeightSchedule
 from lpv_track_env.env import PathTrackingEnv
+from lpv_track_env.observation import ObservationLayout
 from trajectories import CurvatureBands
 
 SET = {"Q": [1, 1, 20, 20], "S": [5, 5, 100, 100], "R": [0.01, 1]}
@@ -68,7 +69,7 @@ def test_weights_as_mappings_are_the_weights_themselves(name: str) -> None:
         ({"Q": [1, 1, 20]}, "weights: Q must be 4 numbers, each >= 0"),
         ({"S": [1, 1, 20, -1]}, r"weights: S\[3\] must be >= 0 and finite, not -1"),
         ({"R": [0.01, "heavy"]}, r"weights: R\[1\] must be >= 0 and finite, not 'heavy'"),
-        ({"P": [1, 1, 1, 1]}, r"unknown matrix of weights 'P'; known: Q, S, R \(nearest: "),
+        ({"P": [1, 1, 1, 1]}, r"unknown matrix of weights 'P'; known: Q, S, R, R_rate \(nearest: "),
         ({**SCHEDULE.as_dict(), "weights": []}, "weights: 2 bands need as many sets, not 0"),
     ],
     ids=str,
@@ -80,6 +81,84 @@ def test_bad_mappings_are_refused_in_one_line(
     with pytest.raises(ValueError, match=message) as refused:
         agents.make(name, PathTrackingEnv("T2"), weights=mapping)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "stages"),
+    [
+        ({"stages": 0.1}, [0.1] * 20),
+        ({"stages": 0.1, "horizon": 7}, [0.1] * 7),
+        ({"horizon": 50}, [0.04] * 50),
+        ({"horizon": 1}, [2.0]),
+        ({"stages": 0.2}, [0.2] * 10),
+        ({"stages": 0.3}, [0.3] * 6),
+        ({"stages": 1}, [1.0] * 2),
+        ({"stages": 0.05, "horizon": 30}, [0.05] * 30),
+        ({"stages": [0.1, 0.4]}, [0.1, 0.4]),
+        ({"stages": np.array([0.5, 1.5]), "horizon": 2}, [0.5, 1.5]),
+    ],
+    ids=str,
+)
+def test_stages_lie_within_the_preview(settings: dict[str, Any], stages: list[float]) -> None:
+    agent: Any = agents.make("lpv-nmpc", PathTrackingEnv("T2"), **settings)
+    np.testing.assert_allclose(agent.problem.periods, stages, rtol=1e-12)
+
+
+@pytest.mark.parametrize("horizon", [None, 8, 15, 30])
+@pytest.mark.parametrize(("control", "first"), [(0.01, 0.05), (0.05, 0.05), (0.1, 0.1)])
+@pytest.mark.parametrize("preview", [(20, 0.1), (30, 0.2), (3, 0.1)])
+def test_stages_grow_by_one_factor_to_the_end_of_the_preview(
+    horizon: int | None, control: float, first: float, preview: tuple[int, float]
+) -> None:
+    seen = preview[0] * preview[1]
+    stages = np.array(
+        stages_of(NmpcSettings(horizon=horizon), ObservationLayout(*preview), control)
+    )
+    assert stages.sum() == pytest.approx(seen, rel=1e-9)
+    assert horizon in {None, len(stages)}
+    factors = stages[1:] / stages[:-1]
+    np.testing.assert_allclose(factors, factors.mean(), rtol=1e-9)
+    assert factors.mean() >= 1.0 - 1e-12
+    if len(stages) * first < seen:
+        assert stages[0] == pytest.approx(first)
+    if horizon is None:
+        # One stage less would have to grow faster.
+        assert factors.mean() <= GROWTH + 1e-9
+        less = stages_of(
+            NmpcSettings(horizon=len(stages) - 1), ObservationLayout(*preview), control
+        )
+        assert less[1] / less[0] > GROWTH
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"stages": 0.1, "horizon": 21},
+            r"21 stages, 2\.1 s, is longer .* 20 steps of 0\.1 s: .*preview_steps=21$",
+        ),
+        ({"stages": 0.11, "horizon": 20}, r"20 stages, 2\.2 s, .*preview_steps=22$"),
+        ({"stages": (0.1,) * 19 + (0.11,)}, r"20 stages, 2\.01 s, .*preview_steps=21$"),
+        ({"stages": 2.5}, r"1 stages, 2\.5 s, .*preview_steps=25$"),
+        ({"stages": 1e-6}, "number of stages must be a whole number from 1 to 1,000, not 2000000"),
+        ({"stages": 0.0}, "stages must be positive and at most 10 s, not 0.0"),
+        ({"stages": float("nan")}, "stages must be positive and at most 10 s, not nan"),
+        ({"stages": "long"}, "stages must be positive and at most 10 s, not 'long'"),
+        ({"stages": ()}, "horizon must be a whole number from 1 to 1,000, not 0"),
+        ({"stages": (0.1, -0.1)}, r"stages\[1\] must be positive and at most 10 s, not -0.1"),
+        ({"stages": (0.1, 0.1), "horizon": 3}, "stages must be 3 numbers, each positive and"),
+        ({"stages": np.ones((2, 2))}, r"stages\[0\] must be positive and at most 10 s, not \["),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("name", ["lpv-nmpc", "lpv-nmpc-ipopt", "lpv-nmpc-tuned"])
+def test_bad_stages_are_refused_in_one_line(
+    name: str, settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message) as refused:
+        agents.make(name, PathTrackingEnv("T2"), **settings)
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) <= 300
 
 
 def test_other_settings_are_checked() -> None:

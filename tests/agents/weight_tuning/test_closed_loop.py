@@ -218,10 +218,9 @@ def test_a_schedule_is_followed_as_predict_does(conditions: str, more: dict[str,
     sets = tuple(TrackingWeights(R=(0.01, scale)) for scale in (1.0, 10.0, 100.0, 1000.0))
     schedule = WeightSchedule(CurvatureBands(), sets, **more)
     settings = {**CALM, "conditions": conditions}
-    loop, turns = (
-        loop_of(3, settings, weights=schedule),
-        InTurns(3, settings, None, weights=schedule),
-    )
+    # Stages that reach into 15 of the preview's 20 steps, and are fewer.
+    chosen = {"weights": schedule, "stages": (0.05, 0.05, *[0.1] * 5, *[0.15] * 6)}
+    loop, turns = loop_of(3, settings, **chosen), InTurns(3, settings, None, **chosen)
     loop.reset(seed=1)
     turns.reset(seed=1)
     for _ in range(3):
@@ -289,7 +288,7 @@ def test_copies_drive_as_their_originals() -> None:
     assert {1, 4, 5} <= set(loop.memory.nmpc.fallbacks)
     loop.copy([0], [2])
     _, trace = traced(
-        loop, 10, np.array([WEIGHTS, WEIGHTS, 3.0 ** np.arange(10) * WEIGHTS, *weights[3:]])
+        loop, 10, np.array([WEIGHTS, WEIGHTS, 3.0 ** np.arange(12) * WEIGHTS, *weights[3:]])
     )
     assert not np.array_equal(trace[2], trace[0])
 

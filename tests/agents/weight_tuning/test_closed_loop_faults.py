@@ -61,7 +61,7 @@ def test_failures_in_the_middle_of_a_call() -> None:
         **CALM, "max_lateral_error": 300.0, "initial_error_range": (30.0, 1.5, 10.0),
         "preview_steps": 50,
     }  # fmt: skip
-    weights = WEIGHTS * 10.0 ** np.random.default_rng(1).uniform(-3, 3, (17, 10))
+    weights = WEIGHTS * 10.0 ** np.random.default_rng(1).uniform(-3, 3, (17, 12))
     loop, turns = loop_of(17, settings), InTurns(17, settings, weights.clip(1e-4, 1e6))
     loop.reset(seed=10)
     turns.reset(seed=10)
@@ -98,9 +98,9 @@ def test_impossible_threads_are_refused(threads: int) -> None:
 @pytest.mark.parametrize(
     ("weights", "message"),
     [
-        (np.ones(9), r"weights must be \(10,\) or \(3, 10\), not \(9,\)"),
-        (np.ones((2, 10)), r"not \(2, 10\)"),
-        (np.ones((3, 10, 1)), r"not \(3, 10, 1\)"),
+        (np.ones(10), r"weights must be \(12,\) or \(3, 12\), not \(10,\)"),
+        (np.ones((2, 12)), r"not \(2, 12\)"),
+        (np.ones((3, 12, 1)), r"not \(3, 12, 1\)"),
         (1.0, r"not \(\)"),
         ([WEIGHTS, WEIGHTS * np.nan, WEIGHTS], "weights of environment 1 must be finite"),
         ([WEIGHTS, WEIGHTS, -WEIGHTS], "weights of environment 2 must be finite and >= 0"),

@@ -314,7 +314,7 @@ def test_numbers_beyond_float32_saturate() -> None:
     ("made", "message"),
     [
         ({"layout": ObservationLayout(30, 0.1)},
-         r"sees preview_steps=30, preview_period=0.1 s; this environment has 20 and 0.05: make"),
+         r"sees preview_steps=30, preview_period=0.1 s; this environment has 20 and 0.1: make"),
         ({"control_period": 0.02},
          r"acts every 0.02 s, this environment every 0.05: make .* control_period=0.02"),
     ],
@@ -375,7 +375,7 @@ def test_files_of_weights(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"weights .*none.json: no such file; give weights="):
         agents.make(NAME, env.single, weights=tmp_path / "none.json")
     with pytest.raises(ValueError, match="not list"):
-        agents.make(NAME, env.single, weights=[1.0] * 10)
+        agents.make(NAME, env.single, weights=[1.0] * 12)
     with pytest.raises(ValueError, match=r"has no setting 'wheights'.*nearest: weights"):
         agents.make(NAME, env.single, wheights=SCHEDULE)
 

@@ -24,8 +24,8 @@ STRAIGHT: dict[str, Any] = {"trajectory": "straight", "conditions": "simulation"
 
 
 def chosen(choice: WeightChoice, action: Any, band: int = 0) -> Array | None:
-    """Set (10,) that is made of an action's numbers; None if it is refused."""
-    row = np.full(10, -1.0)
+    """Set (12,) that is made of an action's numbers; None if it is refused."""
+    row = np.full(12, -1.0)
     taken = weights_for(
         np.asarray(action, dtype=np.float64),
         band,
@@ -36,7 +36,7 @@ def chosen(choice: WeightChoice, action: Any, band: int = 0) -> Array | None:
         row,
     )
     if not taken:
-        np.testing.assert_array_equal(row, np.full(10, -1.0))
+        np.testing.assert_array_equal(row, np.full(12, -1.0))
     return row if taken else None
 
 
@@ -109,7 +109,7 @@ def test_whatever_is_asked_for_stays_within_bounds(
 def test_the_first_set_is_taken_at_once_and_others_at_the_slew_limit() -> None:
     env = begun()
     up, down = np.ones(3, dtype=np.float32), -np.ones(3, dtype=np.float32)
-    target = BASE * [*[10.0] * 8, 1, 1]
+    target = BASE * [*[10.0] * 8, 1, 1, 1, 1]
     np.testing.assert_allclose(env.step(up)[4]["weights"], target, rtol=1e-12)
     # 6 nepers a second over 0.4 s of the 2 ln(10) that lie between.
     weights = env.step(down)[4]["weights"]

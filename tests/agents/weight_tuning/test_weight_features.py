@@ -141,7 +141,7 @@ def filled(o: Any, w: Array, used: Array | None = None, band: int = 0) -> Array:
     base = np.array([one.as_array() for one in CHOICE.schedule.weights])
     x = np.full(features.size(4), np.nan, dtype=np.float32)
     fill_features(
-        np.asarray(o, dtype=np.float32), w, np.zeros(10) if used is None else used, base, band,
+        np.asarray(o, dtype=np.float32), w, np.zeros(12) if used is None else used, base, band,
         SCALES, np.log(3.0), x,
     )  # fmt: skip
     return x
@@ -164,7 +164,7 @@ rows = st.lists(number, min_size=14, max_size=14)
 @given(
     st.lists(rows, min_size=1, max_size=5),
     st.lists(st.tuples(number, number), min_size=5, max_size=5),
-    st.lists(st.floats(LOWEST, HIGHEST), min_size=10, max_size=10), st.integers(-1, 3),
+    st.lists(st.floats(LOWEST, HIGHEST), min_size=12, max_size=12), st.integers(-1, 3),
 )  # fmt: skip
 def test_whatever_is_observed_gives_finite_features(
     observations: list[list[float]],

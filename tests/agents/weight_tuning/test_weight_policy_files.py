@@ -185,9 +185,9 @@ def of_base(**changes: Any) -> Callable[[dict[str, Any]], None]:
         (of_choice(catalogue=[{"P\n": 1}]), "choice.catalogue: "),
         (of_choice(catalogue=[{}] * 6), "outputs, as the choice has entries, not"),
         (of_choice(base=None), "choice.base: 'NoneType'"),
-        (of_choice(base={}), "choice.base: format is None, not 'weight-schedule/2'"),
+        (of_choice(base={}), "choice.base: format is None, not 'weight-schedule/3'"),
         (of_base(format="weight-schedule/1"),
-         "choice.base.format is 'weight-schedule/1', not 'weight-schedule/2'"),
+         "choice.base.format is 'weight-schedule/1', not 'weight-schedule/3'"),
         (lambda s: s["choice"]["base"].pop("bands"), "choice.base: no 'bands' in it"),
         (lambda s: s["choice"]["base"].pop("slew"), "no key 'choice.base.slew'"),
         (of_base(more=1), "unknown key 'choice.base.more'"),
@@ -248,6 +248,11 @@ def test_a_schedule_is_loaded_as_one(tmp_path: Path) -> None:
     older = {**BASE.as_dict(), "format": "weight-schedule/1", "slew": None}
     file.write_text(json.dumps(older))
     assert load(file) == dataclasses.replace(BASE, slew=None)
+    for one in older["weights"]:
+        del one["R_rate"]
+    file.write_text(json.dumps({**older, "format": "weight-schedule/2", "slew": 3.0}))
+    sets = tuple(dataclasses.replace(one, R_rate=(0.0, 0.0)) for one in BASE.weights)
+    assert load(file) == dataclasses.replace(BASE, slew=3.0, weights=sets)
 
 
 def test_a_schedules_own_form_is_its_files(tmp_path: Path) -> None:
@@ -263,8 +268,8 @@ def test_a_schedule_that_cannot_be_read_is_named_as_one(tmp_path: Path) -> None:
     file = tmp_path / "schedule.json"
     file.write_text(json.dumps({**BASE.as_dict(), "blend": 7.0}))
     assert "weight schedule" in refusal(file, load)
-    file.write_text(json.dumps({**BASE.as_dict(), "format": "weight-schedule/3"}))
-    assert "format is 'weight-schedule/3', not 'weight-schedule/2'" in refusal(file, load)
+    file.write_text(json.dumps({**BASE.as_dict(), "format": "weight-schedule/4"}))
+    assert "format is 'weight-schedule/4', not 'weight-schedule/3'" in refusal(file, load)
 
 
 def test_policies_are_not_mistaken_for_one_another(file: Path, tmp_path: Path) -> None:
@@ -282,14 +287,14 @@ def test_policies_are_not_mistaken_for_one_another(file: Path, tmp_path: Path) -
     "content",
     [b"", b"{", b"7", b"[]", b"{}", b"null", b"[" * 100_000, b"\xff\xfe", b"hello",
      b'{"format": 3}', b'{"format": "weight-schedule"}', b'{"format": "mine/1"}',
-     b'{"format": ["weight-schedule/2"]}'],
+     b'{"format": ["weight-schedule/3"]}'],
     ids=lambda content: repr(content[:16]),
 )  # fmt: skip
 def test_what_is_neither_is_told_of_both(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "mine.json").write_bytes(content)
     said = refusal(tmp_path / "mine.json", load)
     assert "is no weight schedule or weight policy: give the .json of a schedule" in said
-    assert "(weight-schedule/2) or of a policy (lpv-track-weights/1)" in said
+    assert "(weight-schedule/3) or of a policy (lpv-track-weights/1)" in said
 
 
 @pytest.mark.parametrize(

@@ -350,16 +350,16 @@ def test_resets_of_single_environments_stand_outside_the_clock(
 
 
 def test_a_recording_is_of_a_closed_loop_at_places_along_the_path() -> None:
-    windows = solvers.record("T2", 10, 2, 4)
+    windows = solvers.record("T2", 2, 4)
     length = trajectories.load("T2").length
     assert [window.arc_length for window in windows] == [0.0, length / 2]
-    env = solvers.environment("T2", 10)
+    env = solvers.environment("T2")
     driver = agents.make(solvers.DRIVER, env)
     for window in windows:
         observation, _ = env.reset(
             seed=0, options={**solvers.START, "arc_length": window.arc_length}
         )
-        assert window.observations.shape == (4, 28)
+        assert window.observations.shape == (4, 48)
         for k, seen in enumerate(window.observations):
             np.testing.assert_array_equal(seen, observation)
             action, _ = driver.predict(observation, episode_start=np.array([k == 0]))

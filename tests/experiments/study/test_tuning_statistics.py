@@ -153,7 +153,7 @@ def test_varied_sets_complement_one_another() -> None:
 def test_a_pool_holds_the_default_set_what_was_found_and_a_sequence() -> None:
     found = [TrackingWeights(Q=(9.0, 9.0, 9.0, 9.0))]
     pool = pool_of(64, found)
-    assert pool.shape == (66, 10)
+    assert pool.shape == (66, 12)
     default = TrackingWeights().as_array()
     np.testing.assert_array_equal(pool[:2], [default, found[0].as_array()])
     factors = np.log(pool[2:] / default) / np.log(100.0)

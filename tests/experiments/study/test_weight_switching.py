@@ -134,7 +134,7 @@ def test_the_adversary_follows_the_worst_branch() -> None:
     short = Setup(episodes=2, paths=3, time_limit=windows * WINDOW, candidates=count)
     found = outcome_of(arm, short)
     rng = np.random.default_rng([0, 0])
-    draws = [arm.draw(rng, 2 * count, BASE).reshape(2, count, 10) for _ in range(windows)]
+    draws = [arm.draw(rng, 2 * count, BASE).reshape(2, count, 12) for _ in range(windows)]
     for episode in range(2):
         taken: list[Any] = []
         for sets in draws:

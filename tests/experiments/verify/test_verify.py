@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agents.nmpc.casadi_solvers import IpoptSolver, discrete_model
+from agents.nmpc.casadi_solvers import IpoptSolver, stage_models
 from agents.nmpc.problem import NmpcProblem, Solution, Status
 from agents.weights import TrackingWeights
 from experiments.cli import main
@@ -39,7 +39,7 @@ from tests.helpers.stand_in_solver import HeldInput, StandIn, WrongDerivative
 
 Array = NDArray[np.float64]
 STAND_INS = Path(stand_in_solver.__file__)
-NO_COST = np.zeros(10)
+NO_COST = np.zeros(12)
 
 
 @pytest.fixture(scope="module")
@@ -69,13 +69,17 @@ def straight(speed: float, **changes: Any) -> tuple[NmpcProblem, Array]:
 def test_cost_of_one_straight_period_by_hand() -> None:
     problem, state = straight(10.0)
     a = 1.0 + M2_MINIBUS.rolling_deceleration  # so that v' = 1
-    weights = np.array([2.0, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0, 23.0, 29.0])
+    weights = np.array([2.0, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0, 23.0, 29.0, 0.31, 0.37])
     reference = np.array([[10.5, 0.1, 0.2, 0.3], [11.0, 0.2, 1.2, 0.5]])
-    price = plan_cost(problem, state, np.array([a, 0.0]), reference, weights, np.array([[a, 0.0]]))
+    last = np.array([a - 0.3, 0.02])
+    price = plan_cost(problem, state, last, reference, weights, np.array([[a, 0.0]]))
     # v: 10 to 10.1 m/s; x: 0 to 1.005 m
     stage = 2 * 0.5**2 + 3 * 0.1**2 + 5 * 0.2**2 + 7 * 0.3**2
     end = 11 * 0.9**2 + 13 * 0.2**2 + 17 * 0.195**2 + 19 * 0.5**2
-    assert price.cost == pytest.approx(0.5 * (stage + end + 23 * a**2), rel=1e-12)
+    # A stage of 0.1 s counts twice; 3 m/s^3 and -0.2 rad/s last as long.
+    rates = 0.31 * 3.0**2 + 0.37 * 0.2**2
+    cost = 0.5 * (2.0 * (stage + 23 * a**2 + rates) + end)
+    assert price.cost == pytest.approx(cost, rel=1e-12)
     np.testing.assert_array_equal(price.slack, 0.0)
     assert price.excess == 0.0
 
@@ -88,7 +92,27 @@ def test_cost_of_broken_soft_constraints_by_hand() -> None:
     inputs = np.array([[a, 0.0]])
     price = plan_cost(problem, state, inputs[0], np.zeros((2, 4)), NO_COST, inputs)
     np.testing.assert_allclose(price.slack, [[0.5, 0.0, 1.0]], atol=1e-12)
-    assert price.cost == pytest.approx(2 * 0.5 + 5 * 1.0 + 0.5 * (7 * 0.25 + 13 * 1.0), rel=1e-12)
+    penalty = 2 * 0.5 + 5 * 1.0 + 0.5 * (7 * 0.25 + 13 * 1.0)
+    assert price.cost == pytest.approx(2.0 * penalty, rel=1e-12)  # 0.1 s count twice
+
+
+def test_cost_of_two_unequal_stages_by_hand() -> None:
+    """Inputs and their rates alone: each stage counts as it is long, each rate as it lasts."""
+    problem = NmpcProblem(M2_MINIBUS, horizon=2, stages=(0.05, 0.2), first_period=0.03)
+    weights = np.array([*[0.0] * 8, 3.0, 5.0, 7.0, 11.0])
+    last, inputs = np.array([0.1, 0.01]), np.array([[0.2, 0.02], [0.7, -0.01]])
+    state = np.array([10.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    price = plan_cost(problem, state, last, np.zeros((3, 4)), weights, inputs)
+    cost = 1.0 * (3 * 0.2**2 + 5 * 0.02**2) + 4.0 * (3 * 0.7**2 + 5 * 0.01**2)
+    # From the middle of one input to that of the next: 0.04 s and 0.125 s.
+    cost += 0.8 * (7 * (0.1 / 0.04) ** 2 + 11 * (0.01 / 0.04) ** 2)
+    cost += 2.5 * (7 * (0.5 / 0.125) ** 2 + 11 * (0.03 / 0.125) ** 2)
+    assert price.cost == pytest.approx(0.5 * cost, rel=1e-12)
+    np.testing.assert_array_equal(price.slack, 0.0)
+    # The bound on the first change allows for a control period, 0.03 s.
+    assert price.excess == 0.0
+    steep = plan_cost(problem, state, last - [0.1, 0.0], np.zeros((3, 4)), weights, inputs)
+    assert steep.excess == pytest.approx(0.2 - 0.03 * M2_MINIBUS.max_jerk)
 
 
 def test_sideslip_and_slow_speed_break_theirs() -> None:
@@ -123,10 +147,10 @@ def test_excess_over_hard_bounds(
     assert price.excess == pytest.approx(excess, abs=1e-12)
 
 
-def test_roll_out_is_casadis_discrete_model(samplers: dict[str, Sampler]) -> None:
+def test_roll_out_is_casadis_stage_models(samplers: dict[str, Sampler]) -> None:
     for problem, case in draws(samplers, 4):
-        model, states = discrete_model(problem), rolled_out(problem, case.state, case.inputs)
-        for k, u in enumerate(case.inputs):
+        states = rolled_out(problem, case.state, case.inputs)
+        for k, (model, u) in enumerate(zip(stage_models(problem), case.inputs, strict=True)):
             same = np.asarray(model(states[k], u)).ravel()
             np.testing.assert_allclose(states[k + 1], same, rtol=1e-10, atol=1e-11)
 
@@ -134,7 +158,8 @@ def test_roll_out_is_casadis_discrete_model(samplers: dict[str, Sampler]) -> Non
 def test_cost_of_ipopts_plan_is_its_objective(samplers: dict[str, Sampler]) -> None:
     # Limits that every situation breaks, or the penalties would go unchecked.
     narrow = M2_MINIBUS.replace(max_lateral_velocity_ratio=0.01, speed_range=(1.0, 5.0))
-    problem = NmpcProblem(narrow, horizon=10, first_period=0.03)
+    stages = tuple(np.linspace(0.07, 0.13, 10))
+    problem = NmpcProblem(narrow, horizon=10, stages=stages, first_period=0.03)
     solver = IpoptSolver(problem, tolerance=1e-9)
     broken = np.zeros(3)
     for _, case in draws(samplers, 8):
