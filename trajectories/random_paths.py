@@ -63,7 +63,7 @@ def limit_path(seed: int) -> ReferencePath:
     in steps of 0.05 g, so that ten seeds in a row cover the range evenly. Top speeds of 20 to
     30 m/s and straights of 20 to 200 m are drawn, lengths from 500 to 900 m. Accelerations of
     2 m/s^2, decelerations of 3 m/s^2 and a jerk of 4 m/s^3 are within the limits of every preset
-    vehicle; they are not reduced where the path turns.
+    vehicle; together with the lateral acceleration they keep within the circle of the same grip.
 
     Raises
     ------
@@ -75,6 +75,7 @@ def limit_path(seed: int) -> ReferencePath:
     limits = SpeedLimits(
         max_speed=float(rng.uniform(20.0, 30.0)), max_lateral_acceleration=grip * GRAVITY,
         max_acceleration=2.0, max_deceleration=3.0, max_jerk=4.0, end_speed=10.0,
+        max_total_acceleration=grip * GRAVITY,
     )  # fmt: skip
     wanted = float(rng.uniform(500.0, 900.0))
     segments = _segments(rng, limits, wanted, (12.0, 80.0), (20.0, 200.0))

@@ -40,6 +40,9 @@ LONG_LAP = 5_000.0
 """m: lap from which a part of it, not all, is planned before and after."""
 LONGEST = 40_000.0
 """m: longest path that is planned, all laps of a closed one included; it takes minutes."""
+FACETS = 4
+"""Facets of a quarter of the polygon within the circle of `max_total_acceleration`; at worst the
+polygon is 2 % smaller, at zero longitudinal or lateral acceleration it touches the circle."""
 CHATTER_WEIGHT = 2e-3
 """Weight of the L1 penalty on changes of acceleration; without it profiles chatter at the caps."""
 
@@ -66,6 +69,9 @@ class SpeedLimits:
     min_speed
         m/s; lower caps are raised to it, so that a kink slows the reference down but never stops
         it. The default is the lowest speed in the paper's constraint table.
+    max_total_acceleration
+        m/s^2, of the vector of longitudinal and lateral acceleration: what a tyre that brakes lacks
+        in the turn. None: each has its own bound alone.
 
     Raises
     ------
@@ -82,10 +88,11 @@ class SpeedLimits:
     wheelbase: float = 5.0
     end_speed: float = 1.5
     min_speed: float = 1.0
+    max_total_acceleration: float | None = None
 
     def __post_init__(self) -> None:
         given = [name for name, value in vars(self).items() if value is not None]
-        needed = {item.name for item in fields(self)} - {"max_deceleration"}
+        needed = {item.name for item in fields(self) if item.default is not None}
         check_fields(self, dict.fromkeys(sorted(needed | set(given)), LIMIT), "speed limits: ")
 
     @property
@@ -176,9 +183,11 @@ def plan_speed(
     # A coarse node takes the lowest cap around it, so that no cap is lost between nodes.
     reach = int(np.ceil(0.5 * length / cells / spacing))
     nodes = np.rint(coarse / spacing).astype(int).clip(0, len(caps) - 1)
-    padded = np.pad(caps, reach, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
-    squared = _plan(windows[nodes].min(axis=1) ** 2, length / cells, limits)
+    lowest, bent = (
+        np.lib.stride_tricks.sliding_window_view(np.pad(values, reach, mode="edge"), 2 * reach + 1)
+        for values in (caps, np.abs(curvature))
+    )
+    squared = _plan(lowest[nodes].min(axis=1) ** 2, bent[nodes].max(axis=1), length / cells, limits)
     smoothed = _smooth(squared, fine * (cells / length))
     planned: Array = np.sqrt(np.minimum(smoothed, limits.max_speed**2))
     return planned
@@ -220,8 +229,36 @@ def _smooth(values: Array, at: Array) -> Array:
     return smoothed
 
 
-def _plan(caps: Array, h: float, limits: SpeedLimits) -> Array:
-    """Plan the squared speed (m,) on a grid of spacing h under squared caps (m,)."""
+def _within_circle(
+    bent: Array, caps: Array, difference: sparse.csr_matrix, limits: SpeedLimits, radius: float
+) -> tuple[sparse.csr_matrix, Array]:
+    """Bound total acceleration in the cells by `radius`: matrix on squared speeds, upper bounds.
+
+    Longitudinal acceleration is `difference` b, (m - 1,), the lateral one at either end of a cell
+    is `bent` b, (m,) 1/m. They keep within a polygon in the circle, whose facets have the normals
+    (+-cos, sin). Facets and cells that other bounds keep from it are left out. Where a speed may
+    not fall to what the lateral acceleration allows, nothing is left for braking.
+    """
+    bent = np.minimum(bent, radius / caps)
+    lateral = sparse.diags(bent).tocsr()
+    rows = [sparse.csr_matrix((0, len(bent)))]
+    for sign, most in ((1.0, limits.max_acceleration), (-1.0, limits.deceleration)):
+        rest = np.sqrt(max(radius**2 - most**2, 0.0)) * np.cos(0.25 * np.pi / FACETS)
+        cells = np.flatnonzero(np.maximum(bent[:-1] * caps[:-1], bent[1:] * caps[1:]) > rest)
+        for facet in range(FACETS):
+            if radius * np.cos(0.5 * np.pi / FACETS * (facet + 1)) < most:
+                angle = 0.5 * np.pi / FACETS * (facet + 0.5)
+                along = sign * np.cos(angle) * difference[cells]
+                rows += [along + np.sin(angle) * lateral[cells + end] for end in (0, 1)]
+    matrix = sparse.vstack(rows, format="csr")
+    return matrix, np.full(matrix.shape[0], radius * np.cos(0.25 * np.pi / FACETS))
+
+
+def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits) -> Array:
+    """Plan the squared speed (m,) on a grid of spacing h under squared caps (m,).
+
+    `bent` is |curvature| (m,), 1/m.
+    """
     m = len(caps)
     end = min(limits.end_speed**2, float(caps[0]), float(caps[-1]))
     upper = caps.copy()
@@ -234,6 +271,9 @@ def _plan(caps: Array, h: float, limits: SpeedLimits) -> Array:
     squared = _without_jerk(upper, h, limits)
     identity = sparse.identity(m - 2, format="csr")
     nothing = sparse.csr_matrix((m - 1, m - 2))
+    circle, radius = sparse.csr_matrix((0, m)), np.empty(0)
+    if (total := limits.max_total_acceleration) is not None:
+        circle, radius = _within_circle(bent, caps, difference, limits, total)
     for _ in range(ITERATIONS):
         inner = np.maximum(squared[1:-1], lower[1:-1])
         # j h b^(-1/2) linearised at b0: j h (1.5 b0^(-1/2) - 0.5 b0^(-3/2) b)
@@ -248,6 +288,7 @@ def _plan(caps: Array, h: float, limits: SpeedLimits) -> Array:
                 sparse.hstack([slope - change, 0 * identity]),
                 sparse.hstack([change, -identity]),
                 sparse.hstack([-change, -identity]),
+                sparse.hstack([circle, sparse.csr_matrix((len(radius), m - 2))]),
             ],
             format="csr",
         )
@@ -257,7 +298,7 @@ def _plan(caps: Array, h: float, limits: SpeedLimits) -> Array:
         faster[0] = min(faster[0], standing)
         slower = np.full(m - 1, limits.deceleration)
         slower[-1] = min(slower[-1], standing)
-        bounds = np.concatenate([faster, slower, constant, constant, np.zeros(2 * (m - 2))])
+        bounds = np.concatenate([faster, slower, constant, constant, np.zeros(2 * (m - 2)), radius])
         weight = np.maximum(squared, end) ** -1.5
         cost = np.concatenate([-weight, np.full(m - 2, CHATTER_WEIGHT)])
         result = linprog(

@@ -49,7 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shared.add_settings(
         parser, "--plan",
         "plan the speed anew: limits of trajectories.SpeedLimits, in SI units, the path's own "
-        "where none is given; grip=0.7 is max_lateral_acceleration=6.867, 0.7 g",
+        "where none is given; grip=0.7 bounds lateral and total acceleration by 0.7 g",
     )  # fmt: skip
     parser.add_argument("--draw", type=file_name, metavar="FILE", help="picture, .png or .svg")
     parser.add_argument("--write", type=file_name, metavar="DIR", help="write native CSV files")
@@ -87,8 +87,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
 def limits_of(path: "ReferencePath", given: Mapping[str, Any]) -> "SpeedLimits":
     """Return the limits of a plan: those given by name, and the path's own for the others.
 
-    `grip` is the lateral acceleration as a share of g. Longitudinal accelerations keep to their own
-    limits, whatever grip a turn takes.
+    `grip` is a share of g that bounds the lateral acceleration, and the total one, so that who
+    brakes in a turn stays within the circle of friction.
 
     Raises
     ------
@@ -104,14 +104,15 @@ def limits_of(path: "ReferencePath", given: Mapping[str, Any]) -> "SpeedLimits":
     from trajectories.speed import GRAVITY
 
     known = fields(SpeedLimits)
-    lateral = "max_lateral_acceleration"
+    by_grip = ("max_lateral_acceleration", "max_total_acceleration")
     for key in given:
         choose("limit in --plan", key, ("grip", *(field.name for field in known)))
     values = {**path.metadata.get("limits", {}), **given}
     if "grip" in values:
-        if lateral in given:
-            raise ValueError(f"--plan: give grip or {lateral}, not both")
-        values[lateral] = GRAVITY * Number(1e-3, 100.0).of("grip", values.pop("grip"))
+        if both := [name for name in by_grip if name in given]:
+            raise ValueError(f"--plan: give grip or {both[0]}, not both")
+        limit = GRAVITY * Number(1e-3, 100.0).of("grip", values.pop("grip"))
+        values |= dict.fromkeys(by_grip, limit)
     needed = [field.name for field in known if field.default is MISSING]
     if missing := [name for name in needed if name not in values]:
         raise ValueError(

@@ -532,6 +532,7 @@ def test_a_plan_is_written_and_driven_as_it_is(
     path, own = trajectories.load(file), trajectories.load(name).metadata["limits"]
     assert path.length == pytest.approx(300.0, abs=0.3)
     assert path.metadata["limits"]["max_lateral_acceleration"] == pytest.approx(0.4 * 9.81)
+    assert path.metadata["limits"]["max_total_acceleration"] == pytest.approx(0.4 * 9.81)
     assert path.metadata["limits"]["max_jerk"] == own["max_jerk"]
     lateral = (path.speed**2 * np.abs(path.curvature)).max()
     assert lateral == pytest.approx(0.4 * 9.81, rel=0.02)

@@ -143,6 +143,29 @@ def test_share_lowers_the_lateral_acceleration() -> None:
     np.testing.assert_allclose(speed, math.sqrt(0.5 * 2.0 * 30.0), rtol=1e-9)
 
 
+@pytest.mark.parametrize(("most", "closed"), [(6.0, False), (4.0, False), (8.0, True)])
+def test_total_acceleration_keeps_within_its_circle(most: float, closed: bool) -> None:
+    """Braking into a bend whose curvature rises slowly: both accelerations are used at once."""
+    s = np.arange(0.0, 400.0 + 0.5 * SPACING, SPACING)
+    curvature = 0.03 * np.sin(np.pi * s / 400.0) ** 4
+    limits = SpeedLimits(30.0, most, 5.0, 5.0, max_jerk=100.0, end_speed=20.0)
+    free, bound = (
+        plan_speed(curvature, SPACING, given, closed=closed)
+        for given in (limits, dataclasses.replace(limits, max_total_acceleration=most))
+    )
+
+    def total(speed: np.ndarray) -> float:
+        along = np.gradient(speed**2, SPACING) / 2.0
+        return float(np.hypot(along, speed**2 * curvature).max())
+
+    # The polygon's corners are on the circle; the grid's nodes are 1 m apart.
+    assert total(free) > 1.1 * most
+    assert 0.95 * most < total(bound) <= 1.01 * most
+    assert (bound <= free + 1e-3).all()
+    with pytest.raises(ValueError, match="max_total_acceleration must be"):
+        dataclasses.replace(limits, max_total_acceleration=0.0)
+
+
 def test_a_kink_slows_the_profile_down_but_never_stops_it() -> None:
     kappa = np.zeros(400)
     kappa[200] = 4.0
