@@ -26,6 +26,7 @@ from experiments.verify.oracles import (
     plan_cost,
 )
 from lpv_track_env import PATH_TRACKING
+from lpv_track_env.bicycle import VX
 from trajectories import load
 
 Array = NDArray[np.float64]
@@ -107,10 +108,21 @@ class Sampler:
             decades = rng.uniform(-WEIGHT_DECADES, WEIGHT_DECADES, len(weights))
             weights = weights * 10.0**decades
         low, high = problem.input_bounds
+        low[0] = self._hardest_braking(float(state[VX]))
         inputs, before = np.empty((problem.horizon, 2)), last
         for i, step in enumerate(problem.input_steps):
             inputs[i] = before = (before + rng.uniform(-1.0, 1.0, 2) * step).clip(low, high)
         return Situation(index, trajectory, vehicle, state, last, reference, weights, inputs)
+
+    def _hardest_braking(self, speed: float) -> float:
+        """Lowest acceleration (m/s^2) by which no plan brakes to below the least permitted speed.
+
+        Runge-Kutta steps are stable from there on; below, derivatives grow without bound.
+        """
+        problem = self.agent.problem
+        car, duration = problem.vehicle, float(problem.times[-1])
+        least = (car.speed_range[0] - speed) / duration + car.rolling_deceleration
+        return max(least, car.longitudinal_acceleration_range[0])
 
     def _move(self, entries: dict[str, slice], observation: Any, rng: np.random.Generator) -> None:
         """Give the vehicle a turning motion, since a reset leaves it going and steering straight.
@@ -130,7 +142,9 @@ class Sampler:
             "longitudinal_speed": speed,
             "lateral_speed": speed * turn.sideslip + rng.normal(0.0, 0.1),
             "yaw_rate": turn.yaw_rate + rng.normal(0.0, 0.1),
-            "acceleration": rng.uniform(*car.longitudinal_acceleration_range),
+            "acceleration": rng.uniform(
+                self._hardest_braking(speed), car.longitudinal_acceleration_range[1]
+            ),
             "steering_angle": np.clip(steering, -car.max_steering_angle, car.max_steering_angle),
         }
         for name, value in new.items():

@@ -60,9 +60,9 @@ def begun(choice: WeightChoice | None = None, **changes: Any) -> WeightTuningEnv
 def test_entries_multiply_the_base(
     directions: str, action: list[float], factors: list[float]
 ) -> None:
-    """On Q's and S's [vx, psi, X, Y]; R stays; beyond 1 they are clipped."""
+    """On Q's and S's [vx, psi, X, Y]; R and R_rate stay; beyond 1 they are clipped."""
     found = chosen(WeightChoice(directions=directions), action)
-    np.testing.assert_allclose(found, BASE * [*factors, 1, 1], rtol=1e-14)
+    np.testing.assert_allclose(found, BASE * [*factors, 1, 1, 1, 1], rtol=1e-14)
 
 
 def test_every_band_has_a_base_of_its_own() -> None:
