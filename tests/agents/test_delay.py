@@ -56,7 +56,9 @@ def gentle(steps: int) -> Array:
 )  # fmt: skip
 def test_what_is_shown_is_what_comes(trajectory: str, given: dict[str, float]) -> None:
     """The same commands drive on: 0.15 s later the vehicle sees what its agent was shown."""
-    env = PathTrackingEnv(trajectory, conditions=Conditions(estimator="truth", **given))
+    env = PathTrackingEnv(
+        trajectory, conditions=Conditions(estimator="truth", **given), preview_period=PERIOD
+    )
     steps, later = 60, 3
     listener = Listener(DrivingTask.of(env), gentle(steps))
     agent = DelayCompensated(listener, listener.task, env.actuation)

@@ -210,17 +210,19 @@ def test_a_case_of_a_residual_counts_the_nmpcs_solves() -> None:
 
 def test_another_preview_is_refused_with_what_to_do() -> None:
     with pytest.raises(ValueError, match="sees") as raised:
-        agents.make(str(driving_file("linear")), environment(preview_steps=30, preview_period=0.1))
+        agents.make(str(driving_file("linear")), environment(preview_steps=30, preview_period=0.2))
     assert str(raised.value) == (
-        f"policy {driving_file('linear')} sees preview_steps=20, preview_period=0.05 s; this "
-        "environment has 30 and 0.1: make the environment with preview_steps=20, "
-        "preview_period=0.05, or train one for it"
+        f"policy {driving_file('linear')} sees preview_steps=20, preview_period=0.1 s; this "
+        "environment has 30 and 0.2: make the environment with preview_steps=20, "
+        "preview_period=0.1, or train one for it"
     )
 
 
 def test_both_at_once_are_told_at_once() -> None:
-    with pytest.raises(ValueError, match=r"with .*preview_period=0\.05, control_period=0\.05, or"):
-        agents.make(str(driving_file("linear")), environment(control_period=0.02))
+    with pytest.raises(ValueError, match=r"with .*preview_period=0\.1, control_period=0\.05, or"):
+        agents.make(
+            str(driving_file("linear")), environment(control_period=0.02, preview_period=0.02)
+        )
 
 
 def test_another_control_period_is_refused_with_what_to_do() -> None:
@@ -229,12 +231,12 @@ def test_another_control_period_is_refused_with_what_to_do() -> None:
         match=r"policy 'ppo' acts every 0\.05 s, this environment every 0\.02: make the "
         r"environment with control_period=0\.05, or train one for it",
     ):
-        LearnedPolicy(task(control_period=0.02, preview_period=0.05), random_policy())
+        LearnedPolicy(task(control_period=0.02), random_policy())
 
 
 def test_periods_that_differ_by_rounding_are_the_same() -> None:
     policy = random_policy(control_period=0.1 * 3, layout=ObservationLayout(20, 0.1 * 3))
-    LearnedPolicy(task(control_period=0.3), policy)
+    LearnedPolicy(task(control_period=0.3, preview_period=0.3), policy)
 
 
 # Names.

@@ -38,7 +38,7 @@ NAME = "lpv-nmpc-tuned"
 SLOW_COMPUTER = REALTIME.replace(computing_delay=(0.03, 0.09))
 SETS = tuple(TrackingWeights(R=(0.01, scale)) for scale in (1.0, 10.0, 100.0, 1000.0))
 SCHEDULE = WeightSchedule(CurvatureBands(), SETS, slew=5.0)
-LAYOUT = ObservationLayout(20, 0.05)
+LAYOUT = ObservationLayout()
 
 
 def policy_of(
