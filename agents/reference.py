@@ -187,9 +187,10 @@ def approach(nodes: Array, lateral_error: Any, speed: Any) -> None:
     """Let the nodes (n + 1, NODE) lead a vehicle far beside the path back to it, in place.
 
     An offset that decays along the path is added, with the heading that goes with it: a reference
-    trajectory in the sense of Richalet (Automatica 29, 1993). The part of the lateral error (m)
-    beyond `NEAR_PATH` decays as exp(-s / d), which a vehicle that follows it sees again at any
-    later time. The length d bounds the angle of approach, and grows with the speed (m/s).
+    trajectory in the sense of Richalet (Automatica 29, 1993). It begins with the part of the
+    lateral error (m) beyond `NEAR_PATH` and decays as exp(-s / d). The length d bounds the angle of
+    approach, and grows with the speed (m/s). Without it a quadratic cost asks for an overshoot: it
+    is cheaper to be on the other side later than on this side now.
     """
     excess = abs(lateral_error) - NEAR_PATH
     if not excess > 0.0:
