@@ -23,6 +23,7 @@ from lpv_track_env.conditions import Actuation
 from lpv_track_env.conditions.vehicle import controlled_stop
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
 from lpv_track_env.task import checked_period
+from lpv_track_env.tyres import FRICTION
 from lpv_track_env.validation import two_numbers
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
@@ -82,6 +83,8 @@ class DrivingTask:
     path: ReferencePath
     actuation: Actuation = NO_DELAYS
     """Nominal delays and lags between a command and its effect, s."""
+    friction: float = math.inf
+    """Nominal friction of tyres and road: the middle of its range, inf without a limit."""
 
     def __post_init__(self) -> None:
         kinds = {
@@ -91,6 +94,7 @@ class DrivingTask:
         for name, kind in kinds.items():
             instance_of(name, getattr(self, name), kind, f"of type {kind.__name__}")
         object.__setattr__(self, "control_period", checked_period(self.control_period))
+        object.__setattr__(self, "friction", FRICTION.of("friction", self.friction))
 
     @property
     def delayed(self) -> bool:
@@ -113,7 +117,7 @@ class DrivingTask:
         TypeError
             If it is not a path tracking environment.
         """
-        names = ("layout", "vehicle", "control_period", "path", "actuation")
+        names = ("layout", "vehicle", "control_period", "path", "actuation", "friction")
         try:
             return cls(*(env.get_wrapper_attr(name) for name in names))
         except AttributeError as error:

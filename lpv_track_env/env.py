@@ -296,11 +296,11 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     @property
     def _nominal_friction(self) -> float:
-        return math.inf if self.conditions is None else self.conditions.ends("friction")[0]
+        return math.inf if self.conditions is None else self.conditions.middle("friction")
 
     @property
     def friction(self) -> float:
-        """Nominal friction of tyres and road: the lower end of its range, inf without a limit."""
+        """Nominal friction of tyres and road: the middle of its range, inf without a limit."""
         if self._plant is None:
             return self._nominal_friction
         return self._plant.nominal_friction(self._nominal_friction)

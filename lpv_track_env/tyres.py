@@ -38,8 +38,11 @@ from typing import Any
 
 from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vehicle import VehicleParameters
-from trajectories.compilation import compiled, compiled_internal
+from trajectories.arguments import Number
+from trajectories.compilation import compiled, compiled_inline, compiled_internal
 
+FRICTION = Number(0.001, math.inf)
+"""Rule of a coefficient of friction; inf is the linear tyre."""
 Parameters = tuple[Any, Any, Any, Any, Any, Any, Any]
 """Arguments of `bicycle.field` from the mass on."""
 
@@ -68,6 +71,12 @@ def constants(
         min(LONGITUDINAL_SHARE * grip, limit), grip, third * caf / lr, third * car / lf,
         -height / (GRAVITY * lr), height / (GRAVITY * lf),
     )  # fmt: skip
+
+
+def of(vehicle: VehicleParameters, friction: float) -> tuple[float, ...]:
+    """Return the `constants` of a vehicle's tyres under a coefficient of friction."""
+    mass, _, lf, lr, caf, car, _ = vehicle.as_array().tolist()
+    return constants(friction, vehicle.centre_of_gravity_height, mass, lf, lr, caf, car)
 
 
 def followed_share(excess: Any, beyond: Any) -> Any:
@@ -101,11 +110,6 @@ def slips(vx: Any, vy: Any, r: Any, delta: Any, q: Any, lf: Any, lr: Any) -> tup
 def secant_share(within: Any, beyond: Any) -> Any:
     """Compute F / (C alpha) with min(z, 1) and max(z, 1), for any backend."""
     return (1.0 - within + within * within * (1.0 / 3.0)) / beyond
-
-
-def tangent_share(within: Any) -> Any:
-    """Compute dF/dalpha / C with min(z, 1), for any backend."""
-    return (1.0 - within) * (1.0 - within)
 
 
 def scheduled(
@@ -157,6 +161,7 @@ compiled_constants = compiled(constants)
 compiled_sharpness = compiled_internal(sharpness)
 compiled_slips = compiled_internal(slips)
 compiled_followed_share = compiled_internal(followed_share)
+compiled_followed_slope = compiled_internal(followed_slope)
 
 
 @compiled_internal
@@ -173,9 +178,35 @@ def followed(a: float, a_max: float) -> float:
 
 
 @compiled_internal
+def command_derivatives(a: float, tyre: Any) -> tuple[float, float, float, float, float, float]:
+    """Compute ax, nf, nr under a command, and their derivatives by it, from `constants`."""
+    a_max, grip, nf, nr, front_transfer, rear_transfer = tyre
+    ax = followed(a, a_max)
+    nf, nr = compiled_sharpness(ax, grip, nf, nr, front_transfer, rear_transfer)
+    slope = compiled_followed_slope(command_excess(a, a_max))
+    # By logarithms: n is 1 / (left load), with left^2 = 1 - (ax / grip)^2.
+    left = slope * ax / (grip * grip - ax * ax)
+    return (
+        ax, nf, nr, slope,
+        nf * (left - slope * front_transfer / (1.0 + front_transfer * ax)),
+        nr * (left - slope * rear_transfer / (1.0 + rear_transfer * ax)),
+    )  # fmt: skip
+
+
+@compiled_internal
 def secant(stiffness: float, n: float, slip: float) -> float:
     """Compute an axle's secant stiffness at a slip angle (rad) in compiled code."""
     z = n * abs(slip)
     if z < 1.0:
         return stiffness * (1.0 - z + z * z * (1.0 / 3.0))
     return stiffness * ((1.0 / 3.0) / z)
+
+
+@compiled_inline
+def axle_shares(z: float) -> tuple[float, float, float]:
+    """Compute F / (C alpha), dF/dalpha / C and dF/dn / (C alpha |alpha|) in compiled code."""
+    if z < 1.0:
+        sticking = 1.0 - z
+        return sticking + z * z * (1.0 / 3.0), sticking * sticking, z * (2.0 / 3.0) - 1.0
+    inverse = 1.0 / z
+    return inverse * (1.0 / 3.0), 0.0, inverse * inverse * (-1.0 / 3.0)

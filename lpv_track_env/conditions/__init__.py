@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env.estimation.estimator import EstimatorSettings
+from lpv_track_env.tyres import FRICTION
 from trajectories.arguments import Number, check_fields, flag, instance_of, shown
 from trajectories.naming import choose
 
@@ -268,7 +269,7 @@ RULES: dict[str, Number] = {
         ("heading_bias", "yaw_rate_bias", "speed_scale", "steering_offset"), Number(-1e6, 1e6)
     ),
     "rolling_factor": Number(0.0, 1000.0),
-    "friction": Number(0.001, math.inf),
+    "friction": FRICTION,
 }
 """Rule of every field that may be a range."""
 USUAL_SPEED = 8.0

@@ -414,7 +414,7 @@ def test_drawn_friction_reaches_the_plant() -> None:
         assert plant.parameters.tire.p_dx1 == pytest.approx(1.1739 * peaks[-1])
     assert 0.3 <= min(peaks) < 0.45
     assert 0.75 < max(peaks) <= 0.9
-    assert env.friction == pytest.approx(0.3 * 1.0489)
+    assert env.friction == pytest.approx(0.6 * 1.0489)
 
 
 def test_all_but_the_plant_is_the_same_code() -> None:
