@@ -261,7 +261,7 @@ def drive_rows(
         if until_band and run.phases[row] == SOLVE and envs.ends[row] == k.RUNNING:
             take_in(
                 row, envs.observations, memory, weights, nmpc.actions, work.nodes,
-                work.lanes.shape[1], period,
+                int(nmpc.constants[nmpc_layout.PREVIEW_STEPS]), period,
             )  # fmt: skip
 
 

@@ -23,6 +23,8 @@ from lpv_track_env import PATH_TRACKING
 from tests.helpers.learned_policies import DRIVING, driving_file
 
 each_agent = pytest.mark.parametrize("name", [*agents.names(), *DRIVING])
+SETTINGS = {"lpv-mpc-frozen": {"horizon": 20, "stages": 0.05}}
+"""What the error of the frozen form, which grows with the stages, leaves able to drive."""
 
 
 def environment(trajectory: Any = "u-turn", **settings: Any) -> gymnasium.Env:
@@ -32,9 +34,8 @@ def environment(trajectory: Any = "u-turn", **settings: Any) -> gymnasium.Env:
 
 
 def new(name: str, **settings: Any) -> Any:
-    return agents.make(
-        str(driving_file(name)) if name in DRIVING else name, environment(), **settings
-    )
+    known = str(driving_file(name)) if name in DRIVING else name
+    return agents.make(known, environment(), **{**SETTINGS.get(name, {}), **settings})
 
 
 @functools.cache
@@ -148,7 +149,7 @@ def test_a_vehicle_without_measurements_stops_and_stands(name: str) -> None:
         speeds.append(info["state"][0])
         assert "end" not in info
     assert max(speeds) > 2.0
-    assert min(speeds) > -0.1
+    assert min(speeds) >= 0.0
     assert abs(speeds[-1]) < 0.1
 
 

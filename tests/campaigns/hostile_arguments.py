@@ -282,9 +282,12 @@ def _sets() -> Any:
 
 def _solve(solver: Any) -> None:
     """Solve once; what is found must be finite."""
+    from agents.weights import WEIGHTS
+
     solution, _ = solver.solve(
-        np.array([8.0, 0, 0, 0, 0, 0]), np.zeros(2), np.tile([8.0, 0, 0, 0], (6, 1)), np.ones(10)
-    )
+        np.array([8.0, 0, 0, 0, 0, 0]), np.zeros(2), np.tile([8.0, 0, 0, 0], (6, 1)),
+        np.ones(WEIGHTS),
+    )  # fmt: skip
     if solution.inputs is not None and not np.isfinite(solution.inputs).all():
         raise ArithmeticError("not finite")
 

@@ -171,7 +171,8 @@ def test_large_initial_errors_are_driven_off(name):
 @each_agent
 @pytest.mark.parametrize("speed", [0.0, -2.0])
 def test_a_vehicle_that_stands_or_rolls_back_sets_off(name, speed):
-    env = environment("straight", preview_steps=5)
+    reverses = VEHICLES["m2-minibus"].replace(speed_range=(-3.0, 30.0))
+    env = environment("straight", "m2-minibus" if speed >= 0.0 else reverses, preview_steps=5)
     speed_error = speed - float(env.unwrapped.path.speed[0])
     lateral, speed_errors, _, end = drive(
         agents.make(name, env), env, speed_error=speed_error, lateral_error=0.5

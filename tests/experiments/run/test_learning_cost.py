@@ -31,7 +31,7 @@ SHORT = {"trajectory": "straight", "env_settings": {"time_limit": 2.0}}
 
 def policy(training=TRAINING, algorithm="ppo"):
     """A policy of random weights."""
-    layout = ObservationLayout(20, 0.05)
+    layout = ObservationLayout()
     rng = np.random.default_rng(0)
     return Policy(
         algorithm=algorithm,

@@ -239,7 +239,7 @@ def test_a_training_starts_from_a_policy_and_does_not_lose_it_at_once(tmp_path: 
         ({"hyperparameters": other_layers}, "hidden layers"),
         ({"hyperparameters": zero}, "origin of actions"),
         ({"vehicle": "course-car"}, "features or range"),
-        ({"preview_period": 0.1}, "preview period"),
+        ({"preview_period": 0.05}, "preview period"),
         ({"preview_steps": 30}, "preview steps"),
     ):
         other = tiny("ppo", start=str(start), **changes)

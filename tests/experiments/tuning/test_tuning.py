@@ -162,7 +162,7 @@ def test_log_multipliers_are_bounded_by_the_span_and_leave_r() -> None:
         np.array([[0.0] * 6, [math.log(2.0), 0, 0, 0, 0, 99.0]]), settings.directions, settings.span
     )
     np.testing.assert_array_equal(moved[0], default)
-    factors = [2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 100.0, 100.0, 1.0, 1.0]
+    factors = [2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 100.0, 100.0, 1.0, 1.0, 1.0, 1.0]
     np.testing.assert_allclose(moved[1], default * factors, rtol=1e-14)
 
 
