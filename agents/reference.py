@@ -22,6 +22,9 @@ Array = NDArray[Any]
 NODE_SPEED, NODE_HEADING, NODE_X, NODE_Y, NODE_ARC_LENGTH = range(5)
 NODE = 5
 """Number of columns of a node."""
+LEAD, PACE = 0.3, 0.8
+"""Speed (m/s) by which nodes are faster than a slow vehicle that they lead, and share of its
+largest acceleration: less than all, so that it can catch up with them."""
 NEAR_PATH = 0.5
 """Lateral error, m, up to which a predictive controller heads for the path itself."""
 APPROACH_SLOPE = 0.4
@@ -74,7 +77,7 @@ def local_reference(
     period: float,
     lengths: Array | None = None,
     *,
-    approaching: bool = False,
+    leading: float | None = None,
 ) -> LocalReference:
     """Reconstruct nodes of the reference from the preview of an observation.
 
@@ -90,8 +93,9 @@ def local_reference(
         Spacing of the preview in the reference's time, s (`ObservationLayout.preview_period`).
     lengths
         Time from each node to the next, (n,) s; by default the preview's K periods.
-    approaching
-        Lead a vehicle far beside the path back to it, as `approach` does.
+    leading
+        Largest acceleration, m/s^2, of a vehicle that the nodes lead: one that is slow along the
+        path, as `fill_nodes_at` does, and one far beside it back to it, as `approach` does.
     """
     curvature = np.asarray(observation.preview_curvature, dtype=np.float64)
     rows = curvature.reshape(-1, curvature.shape[-1])
@@ -99,12 +103,14 @@ def local_reference(
     speed = np.asarray(observation.preview_speed, dtype=np.float64).reshape(rows.shape)
     lengths = np.full(rows.shape[1], period) if lengths is None else lengths
     nodes = np.empty((rows.shape[0], len(lengths) + 1, NODE))
-    _fill_rows(rows, first, speed, period, lengths, nodes)
-    if approaching:
+    if leading is None:
+        _fill_rows(rows, first, speed, period, lengths, np.full(len(rows), math.inf), 0.0, nodes)
+    else:
         errors, speeds = (
             np.asarray(values, dtype=np.float64).reshape(-1)
             for values in (observation.lateral_error, observation.longitudinal_speed)
         )
+        _fill_rows(rows, first, speed, period, lengths, speeds, leading, nodes)
         _approach_rows(nodes, errors, speeds)
     shaped = nodes.reshape(*curvature.shape[:-1], len(lengths) + 1, NODE)
     return LocalReference(
@@ -144,20 +150,31 @@ def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, no
 
 @compiled_internal
 def fill_nodes_at(
-    curvature: Array, first_speed: Any, speed: Array, period: Any, lengths: Array, nodes: Array
-) -> None:
+    curvature: Array, first_speed: Any, speed: Array, period: Any, lengths: Array, vx: Any,
+    rate: Any, nodes: Array,
+) -> None:  # fmt: skip
     """Fill nodes (n + 1, NODE) that are `lengths` (n,) s apart, from the intervals of one preview.
 
     Within an interval of `period` s acceleration and curvature are constant, as in `fill_nodes`.
     Beyond the last interval the reference goes on along it, at its end speed.
+
+    The nodes are no faster than vx + LEAD + PACE `rate` t (m/s, m/s^2): where the reference is,
+    they pass its places more slowly. So a vehicle that is slow, at a standing start for instance,
+    has goals on the path that it can reach; to those of the reference it would cut the bend between
+    them.
     """
     s = x = y = heading = 0.0
     c, d = 1.0, 0.0
     v, at, left, last = first_speed, 0, period, curvature.shape[0] - 1
-    nodes[0, NODE_SPEED], nodes[0, NODE_HEADING], nodes[0, NODE_X] = first_speed, 0.0, 0.0
-    nodes[0, NODE_Y], nodes[0, NODE_ARC_LENGTH] = 0.0, 0.0
+    fastest = max(vx, 0.0) + LEAD
+    nodes[0, NODE_SPEED], nodes[0, NODE_HEADING] = min(first_speed, fastest), 0.0
+    nodes[0, NODE_X], nodes[0, NODE_Y], nodes[0, NODE_ARC_LENGTH] = 0.0, 0.0, 0.0
     for k in range(nodes.shape[0] - 1):
-        rest = lengths[k]
+        rest, gain = lengths[k], PACE * rate * lengths[k]
+        if fastest + 0.5 * gain < v:
+            # The share of the reference's own time.
+            rest *= (fastest + 0.5 * gain) / v
+        fastest += gain
         while rest > 1e-9:
             interval = min(at, last)
             step, after = left, float(speed[interval])
@@ -178,7 +195,7 @@ def fill_nodes_at(
             v, rest, left = after, rest - step, left - step
             if left <= 1e-9:
                 at, left = at + 1, period
-        nodes[k + 1, NODE_SPEED], nodes[k + 1, NODE_HEADING] = v, heading
+        nodes[k + 1, NODE_SPEED], nodes[k + 1, NODE_HEADING] = min(v, fastest), heading
         nodes[k + 1, NODE_X], nodes[k + 1, NODE_Y], nodes[k + 1, NODE_ARC_LENGTH] = x, y, s
 
 
@@ -213,10 +230,13 @@ def _approach_rows(nodes: Array, lateral_error: Array, speed: Array) -> None:
 
 @compiled
 def _fill_rows(
-    curvature: Array, first_speed: Array, speed: Array, period: Any, lengths: Array, nodes: Array
-) -> None:
+    curvature: Array, first_speed: Array, speed: Array, period: Any, lengths: Array, vx: Array,
+    rate: Any, nodes: Array,
+) -> None:  # fmt: skip
     for row in range(nodes.shape[0]):
-        fill_nodes_at(curvature[row], first_speed[row], speed[row], period, lengths, nodes[row])
+        fill_nodes_at(
+            curvature[row], first_speed[row], speed[row], period, lengths, vx[row], rate, nodes[row]
+        )
 
 
 def point_at(

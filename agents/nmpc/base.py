@@ -240,8 +240,9 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
         )  # fmt: skip
         last = np.array([o.acceleration, o.steering_angle]).clip(low, high)
         nodes = local_reference(
-            o, self.task.layout.preview_period, self.problem.periods, approaching=True
-        )
+            o, self.task.layout.preview_period, self.problem.periods,
+            leading=self.problem.vehicle.longitudinal_acceleration_range[1],
+        )  # fmt: skip
         return state, last, np.stack([nodes.speed, nodes.heading, nodes.x, nodes.y], axis=-1)
 
     def replace(

@@ -150,11 +150,11 @@ class NmpcProblem:
 
     @property
     def substeps(self) -> NDArray[np.int64]:
-        """Runge-Kutta steps of each stage (N,), for stability from the least permitted speed on.
+        """Runge-Kutta steps of each stage (N,), for stability at any speed.
 
-        The lateral poles are fastest at standstill, which a speed range may include.
+        The lateral poles are fastest at standstill, from which a plan may have to drive off.
         """
-        pole = fastest_pole(max(self.vehicle.speed_range[0], 0.0), self.vehicle)
+        pole = fastest_pole(0.0, self.vehicle)
         return np.ceil(self.periods * (pole / RK4_STABILITY)).astype(np.int64)
 
     @property

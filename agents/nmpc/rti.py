@@ -155,8 +155,8 @@ def load_observation(observation: Array, constants: Array, stages: Array) -> boo
     speeds = first + (o.shape[0] - first) // 2
     fill_nodes_at(
         o[first:speeds], o[entry.REFERENCE_SPEED], o[speeds:], constants[L.PREVIEW_PERIOD],
-        L.grid(constants, L.LENGTH, stages.shape[0] - 1),
-        stages[:, L.REFERENCE : L.REFERENCE + NODE],
+        L.grid(constants, L.LENGTH, stages.shape[0] - 1), o[entry.LONGITUDINAL_SPEED],
+        constants[L.HIGH_RATE], stages[:, L.REFERENCE : L.REFERENCE + NODE],
     )  # fmt: skip
     approach(
         stages[:, L.REFERENCE : L.REFERENCE + NODE], o[entry.LATERAL_ERROR],
