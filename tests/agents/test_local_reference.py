@@ -8,8 +8,10 @@ from scipy.integrate import simpson
 
 import trajectories
 from agents.reference import (
+    LEAD,
     NEAR_PATH,
     NODE,
+    PACE,
     early_turn,
     fill_nodes,
     fill_nodes_at,
@@ -97,7 +99,7 @@ def test_nodes_at_the_previews_own_times_are_its_nodes():
     for count in (1, 7, 20):
         first, curvature, speed = drawn(rng)
         mine, whole = np.zeros((count + 1, NODE)), np.zeros((count + 1, NODE))
-        fill_nodes_at(curvature, first, speed, PERIOD, np.full(count, PERIOD), mine)
+        fill_nodes_at(curvature, first, speed, PERIOD, np.full(count, PERIOD), math.inf, 0.0, mine)
         fill_nodes(curvature, first, speed, PERIOD, whole)
         np.testing.assert_allclose(mine, whole, rtol=1e-12, atol=1e-12)
 
@@ -161,8 +163,8 @@ def test_a_vehicle_far_beside_the_path_is_led_back_to_it(error, speed):
     row = observed(8.0, 0.02, 8.0)._replace(lateral_error=error, longitudinal_speed=speed)
     lengths = np.full(200, 0.005)
     path, led = (
-        local_reference(row, PERIOD, lengths, approaching=approaching)
-        for approaching in (False, True)
+        local_reference(one, PERIOD, lengths, leading=2.0)
+        for one in (row._replace(lateral_error=0.0), row)
     )
     dx, dy = led.x - path.x, led.y - path.y
     c, d = np.cos(path.heading), np.sin(path.heading)
@@ -182,9 +184,46 @@ def test_a_vehicle_far_beside_the_path_is_led_back_to_it(error, speed):
     np.testing.assert_array_equal(led.speed, path.speed)
     mirrored = local_reference(
         observed(8.0, -0.02, 8.0)._replace(lateral_error=-error, longitudinal_speed=speed),
-        PERIOD, lengths, approaching=True,
+        PERIOD, lengths, leading=2.0,
     )  # fmt: skip
     np.testing.assert_allclose([mirrored.y, mirrored.heading], [-led.y, -led.heading], atol=1e-12)
+
+
+@pytest.mark.parametrize("vx", [7.7, 8.0, 12.0])
+def test_a_vehicle_as_fast_as_the_path_has_its_nodes(vx):
+    rng = np.random.default_rng(6)
+    first, curvature, _ = drawn(rng)
+    # As much faster from node to node as the vehicle can be.
+    speed = 8.0 + PACE * 2.0 * PERIOD * np.arange(1, 21)
+    seen = observed(8.0, curvature, speed)._replace(longitudinal_speed=vx)
+    lengths = np.full(20, PERIOD)
+    for ours, whole in zip(
+        local_reference(seen, PERIOD, lengths, leading=2.0),
+        local_reference(seen, PERIOD, lengths), strict=True,
+    ):  # fmt: skip
+        np.testing.assert_allclose(ours, whole, rtol=1e-12, atol=1e-12)
+    assert first > 0.0
+
+
+@pytest.mark.parametrize("vx", [-1.0, 0.0, 2.5, 6.0])
+def test_a_slow_vehicle_is_led_along_the_path_as_fast_as_it_can_drive(vx):
+    _, curvature, _ = drawn(np.random.default_rng(7))
+    speed = np.concatenate([np.linspace(8.0, 9.0, 10), np.linspace(9.0, 4.0, 10)])
+    seen = observed(8.0, curvature, speed)._replace(longitudinal_speed=vx)
+    lengths = np.full(100, 0.02)
+    led = local_reference(seen, PERIOD, lengths, leading=2.0)
+    time = np.concatenate([[0.0], np.cumsum(lengths)])
+    fastest = max(vx, 0.0) + LEAD + PACE * 2.0 * time
+    assert (led.speed <= fastest + 1e-12).all()
+    # It passes the places of the reference, no faster than that either.
+    fine = local_reference(seen, PERIOD, np.full(2000, 0.001))
+    for name, value in (("x", led.x), ("y", led.y), ("heading", led.heading)):
+        there = np.interp(led.arc_length, fine.arc_length, getattr(fine, name))
+        np.testing.assert_allclose(value, there, atol=1e-5)
+    allowed = np.minimum(fastest, np.interp(led.arc_length, fine.arc_length, fine.speed))
+    np.testing.assert_allclose(led.speed, allowed, rtol=2e-3)
+    gone = np.cumsum(0.5 * (led.speed[1:] + led.speed[:-1]) * lengths)
+    np.testing.assert_allclose(led.arc_length[1:], gone, rtol=0.02)
 
 
 def test_points_between_behind_and_beyond():

@@ -11,6 +11,7 @@ import pytest
 import agents
 from agents.nmpc import layout, rti
 from agents.weights import TrackingWeights, WeightSchedule
+from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.observation import PREVIEW_START
 from tests.helpers.driven_vehicles import drives, environment, made
 from trajectories import CurvatureBands
@@ -371,3 +372,21 @@ def test_horizon_shorter_than_the_preview() -> None:
     np.testing.assert_array_equal(
         *(made(stages=0.1, horizon=7).predict(seen)[0] for seen in (changed, rows))
     )
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "arc_length"),
+    [("u-turn", 45.0), ("u-turn", 55.0), ("T6", 400.0), ("T2", 205.0), ("T3", 235.0)],
+)
+def test_it_drives_off_from_standstill_in_a_bend(trajectory: str, arc_length: float) -> None:
+    env = PathTrackingEnv(trajectory)
+    agent = agents.make("lpv-nmpc", env)
+    observation, _ = env.reset(seed=0, options={"arc_length": arc_length, "speed": 0.0})
+    for step in range(160):
+        action, _ = agent.predict(observation, episode_start=np.array([step == 0]))
+        observation, _, ended, _, info = env.step(action)
+        # Without a reference that it can reach it cut the bends by 0.3 m.
+        assert abs(info["lateral_error"]) < 0.1
+        if ended:
+            break
+    assert info["speed_error"] > -0.5
