@@ -146,7 +146,9 @@ def test_every_argument_reaches_its_place() -> None:
         assert getattr(inner, name) == getattr(wanted, name)
     agent = env.drives.loop.agent
     assert agent.task.vehicle.name == "course-car"
-    assert agent.problem.horizon == 12
+    assert agent.problem.first_period == 0.1
+    assert agent.problem.times[-1] == pytest.approx(12 * 0.15)
+    assert agent.preview_steps == 12
     assert env.observation_space.shape == (44 + 3,)
     assert env.metadata["render_fps"] == 2
     assert env.drives._decider.window == 5
