@@ -19,12 +19,16 @@ from agents.nmpc.schedule import Switching
 from agents.reference import local_reference
 from agents.weights import TrackingWeights, WeightSchedule, weights_from
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
+from lpv_track_env.tyres import FRICTION
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.arguments import Whole, check_fields, instance_of, numbers, shown
+from trajectories.naming import choose
 
 Array = NDArray[np.float64]
 Memory = TypeVar("Memory")
 
+FRICTIONS = ("known", "linear")
+"""Words for a coefficient of friction."""
 FAILURES = Whole(0, 1_000_000_000)
 GROWTH = 1.13
 """Factor from stage to stage: from 0.05 s on, 15 stages are 2 s, the last of them 0.27 s."""
@@ -54,6 +58,9 @@ class NmpcSettings:
         Prediction model and its constraints, by default the task's own vehicle.
     linear_penalty, quadratic_penalty
         Penalties of slack on (vx, vy, vx'), see `NmpcProblem`.
+    friction
+        Coefficient of friction of the model's tyres: a number, "known", the nominal one of the
+        environment, or "linear", the tyre without a limit.
     max_failures
         Failed solves in a row after which the vehicle is brought to a stop.
 
@@ -70,6 +77,7 @@ class NmpcSettings:
     model: VehicleParameters | None = None
     linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0)
     quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0)
+    friction: float | str = "known"
     max_failures: int = 10
 
     def __post_init__(self) -> None:
@@ -85,8 +93,17 @@ class NmpcSettings:
         if self.model is not None:
             instance_of("model", self.model, VehicleParameters, "VehicleParameters or None")
         check_fields(self, {"max_failures": FAILURES})
+        if isinstance(self.friction, str):
+            choose("friction", self.friction, FRICTIONS)
+        else:
+            check_fields(self, {"friction": FRICTION})
         weights = TrackingWeights() if self.weights is None else weights_from(self.weights)
         object.__setattr__(self, "weights", weights)
+
+    def friction_in(self, task: DrivingTask) -> float:
+        """Return the model's coefficient of friction for a task; inf is the linear tyre."""
+        words = {"known": task.friction, "linear": math.inf}
+        return words[self.friction] if isinstance(self.friction, str) else self.friction
 
 
 @dataclass
@@ -175,6 +192,7 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
             first_period=task.control_period,
             linear_penalty=settings.linear_penalty,
             quadratic_penalty=settings.quadratic_penalty,
+            friction=settings.friction_in(task),
         )
         self.preview_steps = self.problem.preview_steps(task.layout.preview_period)
         self.max_failures = settings.max_failures

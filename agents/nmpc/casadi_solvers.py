@@ -67,7 +67,7 @@ RELAXATION = 1e-8
 
 def lpv_field(state: Any, action: Any, problem: NmpcProblem) -> Any:
     """Vector field x' = A(x, u) x + B(x, u) u on CasADi symbols."""
-    a_matrix, b_matrix = lpv.casadi_matrices(state, action, problem.vehicle)
+    a_matrix, b_matrix = lpv.casadi_matrices(state, action, problem.vehicle, problem.friction)
     return ca.mtimes(a_matrix, state) + ca.mtimes(b_matrix, action)
 
 

@@ -96,7 +96,7 @@ class FrozenLpvSolver:
 
     def _continuous(self, x: Array, u: Array, heading: float) -> tuple[Array, Array, Array]:
         """Return A (6, 6), B (6, 2) and c (6,) such that A x + B u + c is the field."""
-        a, b = matrices(x, u, self.problem.vehicle)
+        a, b = matrices(x, u, self.problem.vehicle, self.problem.friction)
         constant = np.zeros(6)
         if self.form == "sinc":
             e = x[PSI] - heading

@@ -32,9 +32,10 @@ Array = NDArray[np.float64]
     LOW_A, HIGH_A, MAX_DELTA,
     LOW_SPEED, HIGH_SPEED, LOW_RATE, HIGH_RATE, RATIO,
     LINEAR, LINEAR_RATE, LINEAR_RATIO, QUADRATIC, QUADRATIC_RATE, QUADRATIC_RATIO,
-    DAMPING_A, DAMPING_DELTA,
-) = range(7, 31)  # fmt: skip
-CONSTANTS_SIZE = 31
+    DAMPING_A, DAMPING_DELTA, TYRE,
+) = range(7, 32)  # fmt: skip
+"""From `TYRE` on the 6 constants of the tyres, see `tyres.constants`."""
+CONSTANTS_SIZE = TYRE + 6
 # Rows of `grid`, an entry a stage: its length (s), Runge-Kutta steps, length by the nominal period,
 # weight of a squared change of input by that of a squared rate, largest changes of a and delta,
 # share of the way to the next stage's input by which a plan is shifted.

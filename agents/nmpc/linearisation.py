@@ -33,8 +33,14 @@ from lpv_track_env.bicycle import (
     compiled_inverse_speed_slope,
     compiled_jacobian,
 )
-from lpv_track_env.integration import integrate, rotate
-from trajectories.compilation import compiled, compiled_internal
+from lpv_track_env.integration import integrate, integrate_sliding, rotate
+from lpv_track_env.tyres import (
+    axle_shares,
+    command_derivatives,
+    compiled_slips,
+    secant,
+)
+from trajectories.compilation import compiled, compiled_inline, compiled_internal
 
 Array = NDArray[Any]
 # Floats, and vectors of six as tuples, in compiled code: numba ignores annotations.
@@ -118,59 +124,121 @@ def substeps(vx: Float, a: Float, length: Float, grids: Float, p: Array) -> int:
 
 
 @compiled_internal
+def tyre_of(p: Array) -> Any:
+    """Return the constants of the model's tyres, as `tyres.constants` does."""
+    t = L.TYRE
+    return p[t], p[t + 1], p[t + 2], p[t + 3], p[t + 4], p[t + 5]
+
+
+@compiled_internal
 def advance(state: Any, a: Float, delta: Float, length: Float, grids: Float, p: Array) -> Any:
     """State (vx, vy, psi, r, X, Y) after a stage of `length` s with constant inputs.
 
     `grids` are the grid's Runge-Kutta steps of the stage, and `p` the constants.
     """
     n = substeps(state[VX], a, length, grids, p)
-    vx, vy, psi, r, x, y = integrate(
-        state[VX], state[VY], 0.0, state[YAW_RATE], 0.0, 0.0, a, delta,
-        p[0], p[1], p[2], p[3], p[4], p[5], p[6], length / n, n,
-    )  # fmt: skip
+    if p[L.TYRE + 1] < math.inf:
+        vx, vy, psi, r, x, y = integrate_sliding(
+            state[VX], state[VY], 0.0, state[YAW_RATE], 0.0, 0.0, a, delta,
+            p[0], p[1], p[2], p[3], p[4], p[5], p[6], tyre_of(p), length / n, n,
+        )  # fmt: skip
+    else:
+        vx, vy, psi, r, x, y = integrate(
+            state[VX], state[VY], 0.0, state[YAW_RATE], 0.0, 0.0, a, delta,
+            p[0], p[1], p[2], p[3], p[4], p[5], p[6], length / n, n,
+        )  # fmt: skip
     c, s = math.cos(state[PSI]), math.sin(state[PSI])
     return vx, vy, state[PSI] + psi, r, state[X] + c * x - s * y, state[Y] + s * x + c * y
 
 
-@compiled_internal
+@compiled_inline
 def _rates(
     vx: Float, vy: Float, r: Float, c: Float, s: Float, a: Float, delta: Float, cd: Float,
-    sd: Float, p: Any,
+    sd: Float, p: Any, command: Any, slides: bool,
 ) -> Any:  # fmt: skip
-    """Vector field and its Jacobian; `p` are the model's 7 parameters."""
+    """Vector field, its Jacobian, and its derivatives (vx', vy', r') by the input a.
+
+    `p` are the model's 7 parameters, `command` the `tyres.command_derivatives` of a if the tyres'
+    friction is limited, which `slides` tells at compile time.
+    """
     m, iz, lf, lr, caf, car, mu = p
     q, slope = compiled_inverse_speed(vx), compiled_inverse_speed_slope(vx)
+    if not slides:
+        return (
+            compiled_field(vx, vy, r, c, s, a, delta, cd, sd, q, m, iz, lf, lr, caf, car, mu),
+            compiled_jacobian(vx, vy, r, delta, cd, sd, q, slope, m, iz, lf, lr, caf, car, mu, caf),
+            (1.0, 0.0, 0.0),
+        )
+    ax, nf, nr, slope_a, nf_a, nr_a = command
+    front, rear = compiled_slips(vx, vy, r, delta, q, lf, lr)
+    distance, rear_distance = abs(front), abs(rear)
+    share, tangent, sharpening = axle_shares(nf * distance)
+    rear_share, rear_tangent, rear_sharpening = axle_shares(nr * rear_distance)
+    # Derivatives of the axles' forces by a, with that of n.
+    front_a = (caf * nf_a) * (front * distance * sharpening)
+    rear_a = (car * nr_a) * (rear * rear_distance * rear_sharpening)
+    across, per_mass, per_inertia = front_a * cd, 1.0 / m, 1.0 / iz
+    secant_f, secant_r = caf * share, car * rear_share
     return (
-        compiled_field(vx, vy, r, c, s, a, delta, cd, sd, q, m, iz, lf, lr, caf, car, mu),
-        compiled_jacobian(vx, vy, r, delta, cd, sd, q, slope, m, iz, lf, lr, caf, car, mu, caf),
-    )
+        compiled_field(
+            vx, vy, r, c, s, ax, delta, cd, sd, q, m, iz, lf, lr, secant_f, secant_r, mu
+        ),
+        compiled_jacobian(
+            vx, vy, r, delta, cd, sd, q, slope, m, iz, lf, lr, caf * tangent, car * rear_tangent,
+            mu, secant_f,
+        ),
+        (
+            slope_a - front_a * sd * per_mass,
+            (rear_a + across) * per_mass,
+            (across * lf - rear_a * lr) * per_inertia,
+        ),
+    )  # fmt: skip
 
 
 @compiled_internal
+def acceleration(state: Any, a: Float, delta: Float, p: Array) -> Float:
+    """Return vx' of the model at a state (vx, vy, psi, r, X, Y) and an input."""
+    vx, cd, sd = state[VX], math.cos(delta), math.sin(delta)
+    q, caf, car, ax = compiled_inverse_speed(vx), p[4], p[5], a
+    if p[L.TYRE + 1] < math.inf:
+        ax, nf, nr, _, _, _ = command_derivatives(a, tyre_of(p))
+        front, rear = compiled_slips(vx, state[VY], state[YAW_RATE], delta, q, p[2], p[3])
+        caf, car = secant(caf, nf, front), secant(car, nr, rear)
+    return compiled_field(
+        vx, state[VY], state[YAW_RATE], 1.0, 0.0, ax, delta, cd, sd, q, p[0], p[1], p[2], p[3],
+        caf, car, p[6],
+    )[0]  # fmt: skip
+
+
+@compiled_inline
 def _directional(
-    j: Any, zx: Float, zy: Float, zp: Float, zr: Float, by_a: Float, by_delta: Float,
-    c: Float, s: Float, k: Any,
+    j: Any, by_input: Any, zx: Float, zy: Float, zp: Float, zr: Float, by_a: Float, by_delta: Float,
+    c: Float, s: Float, k: Any, slides: bool,
 ) -> Any:  # fmt: skip
     """Derivative of the field k (in the order of the state) along one direction."""
+    ahead = j[0] * zx + j[1] * zy + j[2] * zr + j[3] * by_delta
+    aside = j[4] * zx + j[5] * zy + j[6] * zr + j[7] * by_delta
+    turned = j[8] * zx + j[9] * zy + j[10] * zr + j[11] * by_delta
+    if slides:
+        ahead += by_input[0] * by_a
+        aside += by_input[1] * by_a
+        turned += by_input[2] * by_a
+    else:
+        ahead += by_a
     return (
-        j[0] * zx + j[1] * zy + j[2] * zr + j[3] * by_delta + by_a,
-        j[4] * zx + j[5] * zy + j[6] * zr + j[7] * by_delta,
-        zr,
-        j[8] * zx + j[9] * zy + j[10] * zr + j[11] * by_delta,
-        c * zx - s * zy - k[5] * zp,
-        s * zx + c * zy + k[4] * zp,
-    )
+        ahead, aside, zr, turned, c * zx - s * zy - k[5] * zp, s * zx + c * zy + k[4] * zp,
+    )  # fmt: skip
 
 
-@compiled_internal
+@compiled_inline
 def _further(
-    j: Any, zx: Float, zy: Float, zp: Float, zr: Float, step: Float, d: Any, by_a: Float,
-    by_delta: Float, c: Float, s: Float, k: Any,
+    j: Any, by_input: Any, zx: Float, zy: Float, zp: Float, zr: Float, step: Float, d: Any,
+    by_a: Float, by_delta: Float, c: Float, s: Float, k: Any, slides: bool,
 ) -> Any:  # fmt: skip
     """`_directional` for a direction that has moved by `step` times its rate d."""
     return _directional(
-        j, zx + step * d[0], zy + step * d[1], zp + step * d[2], zr + step * d[3],
-        by_a, by_delta, c, s, k,
+        j, by_input, zx + step * d[0], zy + step * d[1], zp + step * d[2], zr + step * d[3],
+        by_a, by_delta, c, s, k, slides,
     )  # fmt: skip
 
 
@@ -180,14 +248,11 @@ def _weighted(k1: Any, k2: Any, k3: Any, k4: Any) -> Any:
     return plus(plus(k1, scaled(plus(k2, k3), 2.0)), k4)
 
 
-@compiled_internal
-def differentiate(e: Array, length: Float, grids: Float, p: Array, out: Array) -> None:
-    """Advance the plan's state from stage e to the next, `out`, and fill the derivatives of e.
-
-    The state is that of `advance`, which describes the arguments. Forward sensitivities through the
-    stages of every Runge-Kutta step, dk = J dz + J_u: exact to rounding for the discrete map, not
-    for the flow that it approximates.
-    """
+@compiled_inline
+def _differentiate(
+    e: Array, length: Float, grids: Float, p: Array, out: Array, command: Any, slides: bool
+) -> None:
+    """`differentiate` with linear or limited tyres; `command` and `slides` as in `_rates`."""
     model = (p[0], p[1], p[2], p[3], p[4], p[5], p[6])
     a, delta = e[L.PLAN_A], e[L.PLAN_DELTA]
     vx, vy, r = e[L.PLAN_VX], e[L.PLAN_VY], e[L.PLAN_R]
@@ -201,32 +266,35 @@ def differentiate(e: Array, length: Float, grids: Float, p: Array, out: Array) -
         z[k] = 0.0
     z[0], z[SEEDS + 1], z[3 * SEEDS + 2] = 1.0, 1.0, 1.0
     for step in range(n):
-        k1, j1 = _rates(vx, vy, r, c, s, a, delta, cd, sd, model)
+        k1, j1, a1 = _rates(vx, vy, r, c, s, a, delta, cd, sd, model, command, slides)
         if step == 0:
             e[RATE] = k1[0]
             e[RATE_VX], e[RATE_VY], e[RATE_R], e[RATE_DELTA] = j1[0], j1[1], j1[2], j1[3]
-            e[RATE_A] = 1.0
+            e[RATE_A] = a1[0]
         c2, s2 = rotate(c, s, half * k1[2])
-        k2, j2 = _rates(
-            vx + half * k1[0], vy + half * k1[1], r + half * k1[3], c2, s2, a, delta, cd, sd, model
-        )
+        k2, j2, a2 = _rates(
+            vx + half * k1[0], vy + half * k1[1], r + half * k1[3],
+            c2, s2, a, delta, cd, sd, model, command, slides,
+        )  # fmt: skip
         c3, s3 = rotate(c, s, half * k2[2])
-        k3, j3 = _rates(
-            vx + half * k2[0], vy + half * k2[1], r + half * k2[3], c3, s3, a, delta, cd, sd, model
-        )
+        k3, j3, a3 = _rates(
+            vx + half * k2[0], vy + half * k2[1], r + half * k2[3],
+            c3, s3, a, delta, cd, sd, model, command, slides,
+        )  # fmt: skip
         c4, s4 = rotate(c, s, h * k3[2])
-        k4, j4 = _rates(
-            vx + h * k3[0], vy + h * k3[1], r + h * k3[3], c4, s4, a, delta, cd, sd, model
-        )
+        k4, j4, a4 = _rates(
+            vx + h * k3[0], vy + h * k3[1], r + h * k3[3],
+            c4, s4, a, delta, cd, sd, model, command, slides,
+        )  # fmt: skip
         for k in range(SEEDS):
             by_a = 1.0 if k == 3 else 0.0
             by_delta = 1.0 if k == 4 else 0.0
             zx, zy, zp = z[k], z[SEEDS + k], z[2 * SEEDS + k]
             zr = z[3 * SEEDS + k]
-            d1 = _directional(j1, zx, zy, zp, zr, by_a, by_delta, c, s, k1)
-            d2 = _further(j2, zx, zy, zp, zr, half, d1, by_a, by_delta, c2, s2, k2)
-            d3 = _further(j3, zx, zy, zp, zr, half, d2, by_a, by_delta, c3, s3, k3)
-            d4 = _further(j4, zx, zy, zp, zr, h, d3, by_a, by_delta, c4, s4, k4)
+            d1 = _directional(j1, a1, zx, zy, zp, zr, by_a, by_delta, c, s, k1, slides)
+            d2 = _further(j2, a2, zx, zy, zp, zr, half, d1, by_a, by_delta, c2, s2, k2, slides)
+            d3 = _further(j3, a3, zx, zy, zp, zr, half, d2, by_a, by_delta, c3, s3, k3, slides)
+            d4 = _further(j4, a4, zx, zy, zp, zr, h, d3, by_a, by_delta, c4, s4, k4, slides)
             d = scaled(_weighted(d1, d2, d3, d4), sixth)
             z[k] = zx + d[0]
             z[SEEDS + k] = zy + d[1]
@@ -255,6 +323,21 @@ def differentiate(e: Array, length: Float, grids: Float, p: Array, out: Array) -
     out[L.PLAN_VX], out[L.PLAN_VY], out[L.PLAN_R] = vx, vy, r
     out[L.PLAN_PSI] = e[L.PLAN_PSI] + psi
     out[L.PLAN_X], out[L.PLAN_Y] = e[L.PLAN_X] + east, e[L.PLAN_Y] + north
+
+
+@compiled_internal
+def differentiate(e: Array, length: Float, grids: Float, p: Array, out: Array) -> None:
+    """Advance the plan's state from stage e to the next, `out`, and fill the derivatives of e.
+
+    The state is that of `advance`, which describes the arguments. Forward sensitivities through the
+    stages of every Runge-Kutta step, dk = J dz + J_u: exact to rounding for the discrete map, not
+    for the flow that it approximates.
+    """
+    if p[L.TYRE + 1] < math.inf:
+        command = command_derivatives(e[L.PLAN_A], tyre_of(p))
+        _differentiate(e, length, grids, p, out, command, True)
+    else:
+        _differentiate(e, length, grids, p, out, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), False)
 
 
 @compiled

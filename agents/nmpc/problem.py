@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.weights import WEIGHTS
+from lpv_track_env import tyres
 from lpv_track_env.bicycle import fastest_pole
 from lpv_track_env.observation import MOST_STEPS
 from lpv_track_env.vehicle import VehicleParameters
@@ -84,6 +85,8 @@ class NmpcProblem:
         the first stage's length.
     linear_penalty, quadratic_penalty
         Penalties of slack on (vx m/s, vy m/s, vx' m/s^2), shape (3,).
+    friction
+        Coefficient of friction of the model's tyres (`lpv_track_env.tyres`); inf makes them linear.
 
     Raises
     ------
@@ -99,9 +102,12 @@ class NmpcProblem:
     first_period: float | None = None
     linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0)
     quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0)
+    friction: float = math.inf
 
     def __post_init__(self) -> None:
-        rules: dict[str, Number | Whole] = {"horizon": HORIZON, "period": PERIOD}
+        rules: dict[str, Number | Whole] = {
+            "horizon": HORIZON, "period": PERIOD, "friction": tyres.FRICTION,
+        }  # fmt: skip
         if self.first_period is not None:
             rules["first_period"] = PERIOD
         check_fields(self, rules)
@@ -166,8 +172,11 @@ class NmpcProblem:
 
     @property
     def input_bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bound of u, each (2,)."""
+        """Lower and upper bound of u, each (2,): accelerations that the tyres follow, too."""
         low, high = self.vehicle.acceleration_range
+        if self.friction < math.inf:
+            most = tyres.FULL * tyres.of(self.vehicle, self.friction)[0]
+            low, high = max(low, -most), min(high, most)
         limit = self.vehicle.max_steering_angle
         return np.array([low, -limit]), np.array([high, limit])
 

@@ -1,6 +1,5 @@
 """Fast solver of the NMPC's problem, compiled: real-time iteration, or SQP to convergence."""
 
-import math
 import time
 from collections.abc import Callable
 from itertools import pairwise
@@ -13,12 +12,8 @@ from agents.nmpc import layout as L
 from agents.nmpc import linearisation, qp, rti
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import INPUTS, NOMINAL_PERIOD, STATES, NmpcProblem, Solution, Status
-from lpv_track_env.bicycle import (
-    LOW_SPEED,
-    compiled_field,
-    compiled_inverse_speed,
-    fastest_pole,
-)
+from lpv_track_env import tyres
+from lpv_track_env.bicycle import LOW_SPEED, fastest_pole
 from trajectories.arguments import Number, Whole, checks_arguments, instance_of, numbers
 from trajectories.compilation import compiled
 
@@ -55,16 +50,11 @@ def roll_out_cost(
     for i in range(n):
         e, end = stages[i], stages[i + 1]
         a, delta = e[L.STEP_A], e[L.STEP_DELTA]
-        following = linearisation.advance(
-            linearisation.taken(e, L.STEP_VX), a, delta, lengths[i], grids[i], p
-        )
+        here = linearisation.taken(e, L.STEP_VX)
+        following = linearisation.advance(here, a, delta, lengths[i], grids[i], p)
         for k in range(6):
             end[L.STEP_VX + k] = following[k]
-        rate = compiled_field(
-            e[L.STEP_VX], e[L.STEP_VY], e[L.STEP_R], 1.0, 0.0, a, delta, math.cos(delta),
-            math.sin(delta), compiled_inverse_speed(e[L.STEP_VX]), p[0], p[1], p[2], p[3], p[4],
-            p[5], p[6],
-        )[0]  # fmt: skip
+        rate = linearisation.acceleration(here, a, delta, p)
         vx, vy = end[L.STEP_VX], end[L.STEP_VY]
         lanes[L.SLACKS[0], i] = max(p[L.LOW_SPEED] - vx, vx - p[L.HIGH_SPEED], 0.0)
         lanes[L.SLACKS[1], i] = max(p[L.LOW_RATE] - rate, rate - p[L.HIGH_RATE], 0.0)
@@ -222,14 +212,15 @@ class RtiSolver:
                 problem.preview_steps(preview),
                 tolerance,
                 *np.concatenate(problem.input_bounds).astype(np.float32),
-                *car.acceleration_range,
-                car.max_steering_angle,
+                problem.input_bounds[0][0],
+                *problem.input_bounds[1],
                 *car.speed_range,
                 *car.longitudinal_acceleration_range,
                 car.max_lateral_velocity_ratio,
                 *np.array(problem.linear_penalty)[order],
                 *np.array(problem.quadratic_penalty)[order],
                 *self.damping,
+                *tyres.of(car, problem.friction),
                 *periods,
                 *problem.substeps,
                 *(periods / NOMINAL_PERIOD),

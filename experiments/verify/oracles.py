@@ -41,10 +41,10 @@ def rolled_out(problem: NmpcProblem, state: Array, inputs: Array) -> Array:
     for i, u in enumerate(inputs):
         h = problem.periods[i] / problem.substeps[i]
         for _ in range(problem.substeps[i]):
-            k1 = derivative(x, u, car)
-            k2 = derivative(x + 0.5 * h * k1, u, car)
-            k3 = derivative(x + 0.5 * h * k2, u, car)
-            k4 = derivative(x + h * k3, u, car)
+            k1 = derivative(x, u, car, problem.friction)
+            k2 = derivative(x + 0.5 * h * k1, u, car, problem.friction)
+            k3 = derivative(x + 0.5 * h * k2, u, car, problem.friction)
+            k4 = derivative(x + h * k3, u, car, problem.friction)
             x = x + h * (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0
         states[i + 1] = x
     return states
@@ -76,7 +76,7 @@ def plan_cost(
     slow, fast = car.speed_range
     braking, driving = car.longitudinal_acceleration_range
     vx, vy = x[1:, VX], x[1:, VY]
-    rate = derivative(x[:-1].T, inputs.T, car)[VX]
+    rate = derivative(x[:-1].T, inputs.T, car, problem.friction)[VX]
     beyond = [
         np.maximum(slow - vx, vx - fast),
         np.abs(vy) - car.max_lateral_velocity_ratio * vx,

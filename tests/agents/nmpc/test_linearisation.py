@@ -83,6 +83,47 @@ def test_derivatives_are_casadis_about_standstill_and_in_reverse(
         assert_right(solver.linearise(state, inputs), inputs, exact)
 
 
+@pytest.mark.parametrize("friction", [0.05, 0.3, 0.8, 1.05, 3.0])
+@each_vehicle
+def test_derivatives_with_limited_friction_are_casadis(
+    car: VehicleParameters, friction: float
+) -> None:
+    """Rolling, sliding, braking beyond what the tyres follow; also those by the acceleration."""
+    problem = NmpcProblem(car.replace(acceleration_range=(-12.0, 12.0)), 1, friction=friction)
+    solver, exact = RtiSolver(problem), CasadiDerivatives(problem)
+    rng = np.random.default_rng(4)
+    states = random_states(rng, 200, (2.0, 30.0))
+    states[::2, [VY, YAW_RATE]] *= 0.1
+    found = []
+    for state in states:
+        inputs = rng.uniform([-12.0, -0.5], [12.0, 0.5], (1, 2))
+        inputs[:, 0] = np.maximum(inputs[:, 0], (1.0 - state[VX]) / problem.period)
+        along = solver.linearise(state, inputs)
+        assert_right(along, inputs, exact)
+        found.append(along.B[0, :, 0])
+    # It matters: commands that are not followed, and those that cost side force.
+    gains, sideways = np.array(found)[:, VX] / problem.period, np.array(found)[:, VY]
+    assert gains.max() > 0.9
+    assert np.abs(sideways).max() > 1e-4
+
+
+@pytest.mark.parametrize("friction", [0.05, 0.8])
+@pytest.mark.parametrize("car", [M2_MINIBUS, COURSE_CAR], ids=PAPER_VEHICLES)
+def test_derivatives_with_limited_friction_at_standstill_and_in_reverse(
+    car: VehicleParameters, friction: float
+) -> None:
+    problem = NmpcProblem(car, horizon=1, friction=friction)
+    solver, exact = RtiSolver(problem), CasadiDerivatives(problem)
+    rng = np.random.default_rng(5)
+    states = random_states(rng, 120, (-8.0, 1.0))
+    states[20:100, VX] *= 0.1
+    states[100:107, VX] = -1.0, -0.3, -1e-9, 0.0, 1e-9, 0.3, 0.999
+    states[20:107, [VY, YAW_RATE]] *= 0.1
+    for state in states:
+        inputs = random_inputs(rng, 1, car)
+        assert_right(solver.linearise(state, inputs), inputs, exact)
+
+
 @each_period
 @each_vehicle
 def test_roll_out_is_runge_kuttas_in_numpy(car: VehicleParameters, period: float) -> None:

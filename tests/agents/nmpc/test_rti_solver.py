@@ -12,7 +12,7 @@ from agents.nmpc.rti_solver import RtiSolver
 from experiments.verify.bench import scaled_error
 from experiments.verify.oracles import plan_cost, rolled_out
 from lpv_track_env.bicycle import PSI, VX, X, Y
-from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VEHICLES, VehicleParameters
+from lpv_track_env.vehicle import BMW_320I, COURSE_CAR, M2_MINIBUS, VEHICLES, VehicleParameters
 from tests.helpers.condensed_qp import excess
 from tests.helpers.nmpc_situations import WEIGHTS, Situation, arc, hard
 
@@ -68,6 +68,25 @@ def test_iterated_it_converges_to_ipopts_optimum(car: VehicleParameters) -> None
         kept = plan_cost(problem, *case.parameters, solved(polished)[0])
         assert price.cost <= kept.cost * (1.0 + 1e-6)
     assert same >= 8
+
+
+@pytest.mark.parametrize("friction", [0.5, 0.8])
+@pytest.mark.parametrize("car", [M2_MINIBUS, BMW_320I], ids=lambda car: car.name)
+def test_iterated_with_limited_friction_it_converges_to_ipopts_optimum(
+    car: VehicleParameters, friction: float
+) -> None:
+    problem = NmpcProblem(car, horizon=15, first_period=0.03, friction=friction)
+    ours, ipopt = RtiSolver(problem, iterations=CONVERGED), IpoptSolver(problem, tolerance=1e-8)
+    same = 0
+    for case in [*cases(5, problem), *cases(5, problem, decades=0.0, errors=0.3)]:
+        mine, _ = ours.solve(*case.parameters)
+        price = plan_cost(problem, *case.parameters, solved(mine)[0])
+        assert price.excess <= 1e-9
+        assert mine.cost == pytest.approx(price.cost, rel=1e-9)
+        theirs, _ = ipopt.solve(*case.parameters)
+        best = plan_cost(problem, *case.parameters, solved(theirs)[0])
+        same += price.cost <= best.cost * (1.0 + 1e-6)
+    assert same >= 9
 
 
 def test_a_warm_start_is_nearer_to_the_same_optimum() -> None:

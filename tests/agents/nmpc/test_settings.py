@@ -1,6 +1,7 @@
 """Settings of the NMPC agents: weights given as mappings, signatures, errors in one line."""
 
 import inspect
+import math
 from typing import Any
 
 import numpy as np
@@ -8,15 +9,20 @@ import pytest
 
 import agents
 from agents.base import DrivingTask
+from agents.nmpc import layout
 from agents.nmpc.base import GROWTH, NmpcSettings, stages_of
 from agents.nmpc.frozen import FrozenLpvMpc
 from agents.nmpc.ipopt_agent import IpoptNmpc
+from agents.nmpc.problem import NmpcProblem
 from agents.nmpc.rti_agent import RtiNmpc
+from agents.nmpc.rti_solver import RtiSolver
 from agents.registry import agent_class
 from agents.weight_tuning.agent import TunedNmpc
 from agents.weights import TrackingWeights, WeightSchedule
+from lpv_track_env.conditions import IDEAL
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.observation import ObservationLayout
+from lpv_track_env.vehicle import M2_MINIBUS
 from trajectories import CurvatureBands
 
 SET = {"Q": [1, 1, 20, 20], "S": [5, 5, 100, 100], "R": [0.01, 1]}
@@ -166,3 +172,34 @@ def test_other_settings_are_checked() -> None:
         NmpcSettings(selection="bands")
     with pytest.raises(ValueError, match="weights must be weights, a schedule or its file, not"):
         NmpcSettings(weights=3)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["lpv-nmpc", "lpv-nmpc-ipopt", "lpv-mpc-frozen", "lpv-nmpc-tuned"])
+def test_friction_is_the_environments_a_number_or_none(name: str) -> None:
+    slippery = PathTrackingEnv("T2", conditions=IDEAL.replace(friction=0.5))
+    between = PathTrackingEnv("T2", conditions=IDEAL.replace(friction=(0.4, 0.8)))
+    for env, settings, wanted in (
+        (PathTrackingEnv("T2"), {}, math.inf),
+        (slippery, {}, 0.5),
+        (between, {"friction": "known"}, pytest.approx(0.6)),
+        (slippery, {"friction": "linear"}, math.inf),
+        (slippery, {"friction": 0.9}, 0.9),
+    ):
+        assert agents.make(name, env, **settings).problem.friction == wanted
+    for bad, message in (
+        ("dry", r"friction 'dry'.*known, linear"),
+        (0.0, r"friction must be in \[0.001, inf\]"),
+        (math.nan, r"friction must be in \[0.001, inf\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            agents.make(name, slippery, friction=bad)
+
+
+def test_inputs_are_bounded_by_what_the_tyres_follow() -> None:
+    low, high = NmpcProblem(M2_MINIBUS, friction=0.2).input_bounds
+    most = 1.2 * 0.95 * 0.2 * 9.81
+    np.testing.assert_allclose([low[0], high[0]], [-most, most])
+    dry = NmpcProblem(M2_MINIBUS, friction=1.0).input_bounds
+    np.testing.assert_array_equal(dry, NmpcProblem(M2_MINIBUS).input_bounds)
+    constants = RtiSolver(NmpcProblem(M2_MINIBUS, friction=0.2)).constants
+    np.testing.assert_array_equal(constants[[layout.LOW_A, layout.HIGH_A]], [low[0], high[0]])
