@@ -1,6 +1,7 @@
 """The real-time NMPC on observations of every kind: a status for each, and an action to drive."""
 
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,11 +17,12 @@ MAX_ITERATIONS = 44
 """Turns of both methods, with a last try to end in a guess."""
 
 
+@pytest.mark.parametrize("friction", ["linear", 0.05, 0.3, 1.0])
 @pytest.mark.parametrize("vehicle", PAPER_VEHICLES)
-def test_wild_observations(vehicle: str) -> None:
-    """24,000 in all. What cannot be solved says so, and every action can be driven."""
+def test_wild_observations(vehicle: str, friction: Any) -> None:
+    """48,000 in all. What cannot be solved says so, and every action can be driven."""
     env = environment(vehicle=vehicle)
-    agent, rng, n = made(env), np.random.default_rng(5), 3000
+    agent, rng, n = made(env, friction=friction), np.random.default_rng(5), 1500
     statuses: Counter[str] = Counter()
     for _ in range(2):
         rows = wild_observations(rng, n, agent.task.layout.preview_steps)
