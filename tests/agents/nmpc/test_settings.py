@@ -174,7 +174,7 @@ def test_other_settings_are_checked() -> None:
         NmpcSettings(weights=3)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", ["lpv-nmpc", "lpv-nmpc-ipopt", "lpv-mpc-frozen", "lpv-nmpc-tuned"])
+@pytest.mark.parametrize("name", ["lpv-nmpc", "lpv-nmpc-ipopt", "lpv-mpc-frozen"])
 def test_friction_is_the_environments_a_number_or_none(name: str) -> None:
     slippery = PathTrackingEnv("T2", conditions=IDEAL.replace(friction=0.5))
     between = PathTrackingEnv("T2", conditions=IDEAL.replace(friction=(0.4, 0.8)))
