@@ -22,7 +22,7 @@ Array = NDArray[Any]
 NODE_SPEED, NODE_HEADING, NODE_X, NODE_Y, NODE_ARC_LENGTH = range(5)
 NODE = 5
 """Number of columns of a node."""
-LEAD, PACE = 0.3, 0.8
+LEAD, SHARE = 0.3, 0.8
 """Speed (m/s) by which nodes are faster than a slow vehicle that they lead, and share of its
 largest acceleration: less than all, so that it can catch up with them."""
 NEAR_PATH = 0.5
@@ -94,8 +94,8 @@ def local_reference(
     lengths
         Time from each node to the next, (n,) s; by default the preview's K periods.
     leading
-        Largest acceleration, m/s^2, of a vehicle that the nodes lead: one that is slow along the
-        path, as `fill_nodes_at` does, and one far beside it back to it, as `approach` does.
+        Largest acceleration, m/s^2, of the vehicle; with it the nodes lead a vehicle far from its
+        reference, as `fill_leading_nodes` does.
     """
     curvature = np.asarray(observation.preview_curvature, dtype=np.float64)
     rows = curvature.reshape(-1, curvature.shape[-1])
@@ -104,14 +104,16 @@ def local_reference(
     lengths = np.full(rows.shape[1], period) if lengths is None else lengths
     nodes = np.empty((rows.shape[0], len(lengths) + 1, NODE))
     if leading is None:
-        _fill_rows(rows, first, speed, period, lengths, np.full(len(rows), math.inf), 0.0, nodes)
+        _fill_rows(rows, first, speed, period, lengths, nodes)
     else:
-        errors, speeds = (
+        vx, heading, error = (
             np.asarray(values, dtype=np.float64).reshape(-1)
-            for values in (observation.lateral_error, observation.longitudinal_speed)
-        )
-        _fill_rows(rows, first, speed, period, lengths, speeds, leading, nodes)
-        _approach_rows(nodes, errors, speeds)
+            for values in (
+                observation.longitudinal_speed, observation.heading_error,
+                observation.lateral_error,
+            )
+        )  # fmt: skip
+        _lead_rows(rows, first, speed, period, lengths, vx, heading, error, leading, nodes)
     shaped = nodes.reshape(*curvature.shape[:-1], len(lengths) + 1, NODE)
     return LocalReference(
         arc_length=shaped[..., NODE_ARC_LENGTH],
@@ -150,7 +152,7 @@ def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, no
 
 @compiled_internal
 def fill_nodes_at(
-    curvature: Array, first_speed: Any, speed: Array, period: Any, lengths: Array, vx: Any,
+    curvature: Array, first_speed: Any, speed: Array, period: Any, lengths: Array, pace: Any,
     rate: Any, nodes: Array,
 ) -> None:  # fmt: skip
     """Fill nodes (n + 1, NODE) that are `lengths` (n,) s apart, from the intervals of one preview.
@@ -158,19 +160,17 @@ def fill_nodes_at(
     Within an interval of `period` s acceleration and curvature are constant, as in `fill_nodes`.
     Beyond the last interval the reference goes on along it, at its end speed.
 
-    The nodes are no faster than vx + LEAD + PACE `rate` t (m/s, m/s^2): where the reference is,
-    they pass its places more slowly. So a vehicle that is slow, at a standing start for instance,
-    has goals on the path that it can reach; to those of the reference it would cut the bend between
-    them.
+    The nodes are no faster than pace + LEAD + SHARE `rate` t (m/s, m/s^2): where the reference is,
+    they pass its places more slowly.
     """
     s = x = y = heading = 0.0
     c, d = 1.0, 0.0
     v, at, left, last = first_speed, 0, period, curvature.shape[0] - 1
-    fastest = max(vx, 0.0) + LEAD
+    fastest = max(pace, 0.0) + LEAD
     nodes[0, NODE_SPEED], nodes[0, NODE_HEADING] = min(first_speed, fastest), 0.0
     nodes[0, NODE_X], nodes[0, NODE_Y], nodes[0, NODE_ARC_LENGTH] = 0.0, 0.0, 0.0
     for k in range(nodes.shape[0] - 1):
-        rest, gain = lengths[k], PACE * rate * lengths[k]
+        rest, gain = lengths[k], SHARE * rate * lengths[k]
         if fastest + 0.5 * gain < v:
             # The share of the reference's own time.
             rest *= (fastest + 0.5 * gain) / v
@@ -200,6 +200,22 @@ def fill_nodes_at(
 
 
 @compiled_internal
+def fill_leading_nodes(
+    curvature: Array, first_speed: Any, speed: Array, period: Any, lengths: Array, vx: Any,
+    heading_error: Any, lateral_error: Any, rate: Any, nodes: Array,
+) -> None:  # fmt: skip
+    """Fill nodes as `fill_nodes_at` does, such that they lead a vehicle far from its reference.
+
+    A vehicle that is slow along the path, at a standing start for instance or because it heads
+    elsewhere, gets goals that it can reach with the acceleration `rate` (m/s^2): to those of the
+    reference it would cut the bend between. One far beside the path is led back by `approach`.
+    """
+    pace = vx * math.cos(heading_error)
+    fill_nodes_at(curvature, first_speed, speed, period, lengths, pace, rate, nodes)
+    approach(nodes, lateral_error, vx)
+
+
+@compiled_internal
 def approach(nodes: Array, lateral_error: Any, speed: Any) -> None:
     """Let the nodes (n + 1, NODE) lead a vehicle far beside the path back to it, in place.
 
@@ -223,20 +239,25 @@ def approach(nodes: Array, lateral_error: Any, speed: Any) -> None:
 
 
 @compiled
-def _approach_rows(nodes: Array, lateral_error: Array, speed: Array) -> None:
+def _fill_rows(
+    curvature: Array, first_speed: Array, speed: Array, period: Any, lengths: Array, nodes: Array
+) -> None:
     for row in range(nodes.shape[0]):
-        approach(nodes[row], lateral_error[row], speed[row])
+        fill_nodes_at(
+            curvature[row], first_speed[row], speed[row], period, lengths, math.inf, 0.0, nodes[row]
+        )
 
 
 @compiled
-def _fill_rows(
+def _lead_rows(
     curvature: Array, first_speed: Array, speed: Array, period: Any, lengths: Array, vx: Array,
-    rate: Any, nodes: Array,
+    heading_error: Array, lateral_error: Array, rate: Any, nodes: Array,
 ) -> None:  # fmt: skip
     for row in range(nodes.shape[0]):
-        fill_nodes_at(
-            curvature[row], first_speed[row], speed[row], period, lengths, vx[row], rate, nodes[row]
-        )
+        fill_leading_nodes(
+            curvature[row], first_speed[row], speed[row], period, lengths, vx[row],
+            heading_error[row], lateral_error[row], rate, nodes[row],
+        )  # fmt: skip
 
 
 def point_at(

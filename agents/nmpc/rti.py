@@ -27,7 +27,7 @@ from agents.nmpc.qp import (
     clamp,
     solve_qp,
 )
-from agents.reference import NODE, approach, fill_nodes_at
+from agents.reference import NODE, fill_leading_nodes
 from lpv_track_env import observation as entry
 from trajectories.compilation import (
     compiled,
@@ -153,14 +153,11 @@ def load_observation(observation: Array, constants: Array, stages: Array) -> boo
     e[L.PLAN_X], e[L.PLAN_Y] = 0.0, o[entry.LATERAL_ERROR]
     first = entry.PREVIEW_START
     speeds = first + (o.shape[0] - first) // 2
-    fill_nodes_at(
+    fill_leading_nodes(
         o[first:speeds], o[entry.REFERENCE_SPEED], o[speeds:], constants[L.PREVIEW_PERIOD],
-        L.grid(constants, L.LENGTH, stages.shape[0] - 1), o[entry.LONGITUDINAL_SPEED],
+        L.grid(constants, L.LENGTH, stages.shape[0] - 1),
+        o[entry.LONGITUDINAL_SPEED], o[entry.HEADING_ERROR], o[entry.LATERAL_ERROR],
         constants[L.HIGH_RATE], stages[:, L.REFERENCE : L.REFERENCE + NODE],
-    )  # fmt: skip
-    approach(
-        stages[:, L.REFERENCE : L.REFERENCE + NODE], o[entry.LATERAL_ERROR],
-        o[entry.LONGITUDINAL_SPEED],
     )  # fmt: skip
     return True
 

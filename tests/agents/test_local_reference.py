@@ -11,7 +11,7 @@ from agents.reference import (
     LEAD,
     NEAR_PATH,
     NODE,
-    PACE,
+    SHARE,
     early_turn,
     fill_nodes,
     fill_nodes_at,
@@ -194,7 +194,7 @@ def test_a_vehicle_as_fast_as_the_path_has_its_nodes(vx):
     rng = np.random.default_rng(6)
     first, curvature, _ = drawn(rng)
     # As much faster from node to node as the vehicle can be.
-    speed = 8.0 + PACE * 2.0 * PERIOD * np.arange(1, 21)
+    speed = 8.0 + SHARE * 2.0 * PERIOD * np.arange(1, 21)
     seen = observed(8.0, curvature, speed)._replace(longitudinal_speed=vx)
     lengths = np.full(20, PERIOD)
     for ours, whole in zip(
@@ -213,7 +213,7 @@ def test_a_slow_vehicle_is_led_along_the_path_as_fast_as_it_can_drive(vx):
     lengths = np.full(100, 0.02)
     led = local_reference(seen, PERIOD, lengths, leading=2.0)
     time = np.concatenate([[0.0], np.cumsum(lengths)])
-    fastest = max(vx, 0.0) + LEAD + PACE * 2.0 * time
+    fastest = max(vx, 0.0) + LEAD + SHARE * 2.0 * time
     assert (led.speed <= fastest + 1e-12).all()
     # It passes the places of the reference, no faster than that either.
     fine = local_reference(seen, PERIOD, np.full(2000, 0.001))
@@ -224,6 +224,17 @@ def test_a_slow_vehicle_is_led_along_the_path_as_fast_as_it_can_drive(vx):
     np.testing.assert_allclose(led.speed, allowed, rtol=2e-3)
     gone = np.cumsum(0.5 * (led.speed[1:] + led.speed[:-1]) * lengths)
     np.testing.assert_allclose(led.arc_length[1:], gone, rtol=0.02)
+
+
+def test_a_vehicle_that_heads_elsewhere_is_led_as_one_that_is_slow():
+    _, curvature, _ = drawn(np.random.default_rng(8))
+    seen = observed(8.0, curvature, 8.0)._replace(longitudinal_speed=8.0, heading_error=1.0)
+    slow = observed(8.0, curvature, 8.0)._replace(longitudinal_speed=8.0 * math.cos(1.0))
+    lengths = np.full(20, PERIOD)
+    turned, led = (local_reference(one, PERIOD, lengths, leading=2.0) for one in (seen, slow))
+    for one, other in zip(turned, led, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert led.speed[0] == pytest.approx(8.0 * math.cos(1.0) + LEAD)
 
 
 def test_points_between_behind_and_beyond():
