@@ -33,11 +33,13 @@ EARLIER = ("weight-schedule/1", "weight-schedule/2")
 class TrackingWeights:
     """Diagonals of the cost: Q (stage) and S (terminal) on [vx, psi, X, Y], R and R_rate on inputs.
 
-    R weighs [a, delta], R_rate their rates [jerk, steering rate]; `agents.nmpc.problem` has units.
+    X and Y are positions along and across the path. R weighs [a, delta], R_rate their rates [jerk,
+    steering rate]; `agents.nmpc.problem` has units.
 
     Only their ratios affect the plan. The defaults track all six trajectories within centimetres.
-    Heading has a tenth of the weight of position: a car drives through a bend with sideslip, so a
-    heading error of zero would cost lateral error.
+    Heading has a tenth of the weight of lateral position: a car drives through a bend with
+    sideslip, so a heading error of zero would cost lateral error. Position along the path has a
+    hundredth: a car that the limit on vx' holds back would steer to gain on it.
 
     Raises
     ------
@@ -45,8 +47,8 @@ class TrackingWeights:
         For a wrong number of weights, or one that is negative or not finite.
     """
 
-    Q: tuple[float, float, float, float] = (1.0, 1.0, 10.0, 10.0)
-    S: tuple[float, float, float, float] = (5.0, 5.0, 50.0, 50.0)
+    Q: tuple[float, float, float, float] = (1.0, 1.0, 0.1, 10.0)
+    S: tuple[float, float, float, float] = (5.0, 5.0, 0.5, 50.0)
     R: tuple[float, float] = (0.01, 1.0)
     R_rate: tuple[float, float] = (0.001, 0.06)
 

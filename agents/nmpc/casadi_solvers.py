@@ -175,8 +175,10 @@ class _Nlp:
         )
 
     def error(self, i: int, state: Any) -> Any:
-        """Output error at node i."""
-        return self.reference[:, i] - ca.mtimes(ca.DM(lpv.C), state)
+        """Output error at node i, its position along and across the path."""
+        e = self.reference[:, i] - ca.mtimes(ca.DM(lpv.C), state)
+        c, s = ca.cos(self.reference[1, i]), ca.sin(self.reference[1, i])
+        return ca.vertcat(e[:2], c * e[2] + s * e[3], c * e[3] - s * e[2])
 
     def as_dict(self) -> dict[str, Any]:
         """Return the NLP as `casadi.nlpsol` takes it."""

@@ -81,7 +81,9 @@ LONGEST = 176
 (
     SLOPE_A, SLOPE_DELTA, SLOPE_CHANGE_A, SLOPE_CHANGE_DELTA, SLOPE_RATE, SLOPE_VX, SLOPE_VY,
 ) = range(185, 192)  # fmt: skip
-LANES = 192
+# Hessian of the cost by the position at the end of each stage.
+PRICE_X, PRICE_CROSS, PRICE_Y = range(192, 195)
+LANES = 195
 
 
 @compiled_in_place

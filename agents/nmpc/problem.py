@@ -5,13 +5,16 @@ u = [a, delta], output y = C x = [vx, psi, X, Y] (kumar2025lpv, section III)::
 
     min   1/2 e_N' S e_N + sum_{i<N} h_i/T0 [ 1/2 (e_i' Q e_i + u_i' R u_i) + penalty(slack_i) ]
                          + sum_{i<N} d_i/T0   1/2 v_i' R_rate v_i
-    e_i = reference_i - C x_i,  v_i = (u_i - u_{i-1}) / d_i                   (u_{-1}: in force now)
+    e_i = T_i (reference_i - C x_i),  v_i = (u_i - u_{i-1}) / d_i    (u_{-1}: in force now)
     x_{i+1} = F(x_i, u_i)                        Runge-Kutta steps of x' = A(x, u) x + B(x, u) u
     |delta_i| <= delta_max,  a_min <= a_i <= a_max
     |delta_i - delta_{i-1}| <= d_i delta'_max,  |a_i - a_{i-1}| <= d_i a'_max
     vx_min <= vx_i <= vx_max        (soft)       i = 1..N
     |vy_i| <= ratio vx_i            (soft)       i = 1..N
     vx'_min <= vx'(x_i, u_i) <= vx'_max (soft)   i = 0..N-1
+
+T_i turns the position's error to the reference's heading: so the weights on X and Y are those along
+and across the path at the node. (With the paper's equal weights the two forms are the same.)
 
 Stage i is h_i long, and d_i is the time from the middle of the stage before to its own middle; the
 bound on the first change allows for one control period. The sums approximate integrals over time,

@@ -296,6 +296,7 @@ def solve_qp(
     """
     n = lanes.shape[1]
     copy_point(stages, L.NOW_A, L.PLAN_A)
+    riccati.fill_prices(stages, lanes, weights, constants)
     measure_gaps(stages, lanes, last_a, last_delta, constants)
     guess(lanes)
     mu, worst, share, tolerance = START_BARRIER, 0.0, 1.0, constants[L.TOLERANCE]

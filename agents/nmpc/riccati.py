@@ -6,7 +6,8 @@ A step minimises, over dx_0 = 0, dx_{i+1} = A_i dx_i + B_i du_i and du_{-1} = 0,
         + 1/2 h_i (n_i' [dx_i; du_i])^2 + k_i n_i' [dx_i; du_i]
         + 1/2 (du_i - du_{i-1})' W_i (du_i - du_{i-1}) + w_i' (du_i - du_{i-1})
 
-with n_i the gradient of vx', Hu and W diagonal, and Hx diagonal except for the block of (vx, vy).
+with n_i the gradient of vx', Hu and W diagonal, and Hx diagonal except for the blocks of (vx, vy)
+and (X, Y).
 Hessians and gradients are those of the cost, at the solution so far, plus the terms of the
 inequalities (barrier and slope in the lanes of `layout`; those of vx and vy hold at the end of a
 stage). The value function of stage i depends on dx_i and p = du_{i-1}:
@@ -86,6 +87,22 @@ def _put(e: Array, at: int, ka: Six, by: Float, c: Six) -> None:
 
 
 @compiled_internal
+def fill_prices(stages: Array, lanes: Array, weights: Array, constants: Array) -> None:
+    """Fill the Hessian of the cost by positions, from weights (12,) along and across the path."""
+    n = lanes.shape[1]
+    shares = L.grid(constants, L.SHARE, n)
+    for i in range(n):
+        heading = stages[i + 1, L.REFERENCE_HEADING]
+        c, s = math.cos(heading), math.sin(heading)
+        last = i == n - 1
+        along = weights[6] if last else shares[i + 1] * weights[2]
+        across = weights[7] if last else shares[i + 1] * weights[3]
+        lanes[L.PRICE_X, i] = c * c * along + s * s * across
+        lanes[L.PRICE_CROSS, i] = c * s * (along - across)
+        lanes[L.PRICE_Y, i] = s * s * along + c * c * across
+
+
+@compiled_internal
 def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> None:
     """Fill the stages' gains for weights (12,), the damping of `constants` and the barrier.
 
@@ -96,8 +113,9 @@ def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> Non
     damping_a, damping_delta = constants[L.DAMPING_A], constants[L.DAMPING_DELTA]
     p00 = weights[4] + lanes[L.BARRIER_VX, n - 1]
     p01, p11 = lanes[L.BARRIER_CROSS, n - 1], lanes[L.BARRIER_VY, n - 1]
-    p22, p44, p55 = weights[5], weights[6], weights[7]
-    p02 = p03 = p04 = p05 = p12 = p13 = p14 = p15 = p23 = p24 = p25 = p33 = p34 = p35 = p45 = 0.0
+    p22, p44, p55 = weights[5], lanes[L.PRICE_X, n - 1], lanes[L.PRICE_Y, n - 1]
+    p45 = lanes[L.PRICE_CROSS, n - 1]
+    p02 = p03 = p04 = p05 = p12 = p13 = p14 = p15 = p23 = p24 = p25 = p33 = p34 = p35 = 0.0
     # T's columns (by a and by delta of the input before) and U.
     ta = td = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     uaa = uad = udd = 0.0
@@ -180,9 +198,9 @@ def factor(stages: Array, lanes: Array, weights: Array, constants: Array) -> Non
         p33 = _entry(z3[3], k, c3, c3, qa3, ka3, qd3, kd3)
         p34 = _entry(z3[4], k, c4, c3, qa3, ka4, qd3, kd4)
         p35 = _entry(z3[5], k, c5, c3, qa3, ka5, qd3, kd5)
-        p44 = _entry(p44 + weights[2] * share, k, c4, c4, qa4, ka4, qd4, kd4)
-        p45 = _entry(p45, k, c4, c5, qa4, ka5, qd4, kd5)
-        p55 = _entry(p55 + weights[3] * share, k, c5, c5, qa5, ka5, qd5, kd5)
+        p44 = _entry(p44 + lanes[L.PRICE_X, i - 1], k, c4, c4, qa4, ka4, qd4, kd4)
+        p45 = _entry(p45 + lanes[L.PRICE_CROSS, i - 1], k, c4, c5, qa4, ka5, qd4, kd5)
+        p55 = _entry(p55 + lanes[L.PRICE_Y, i - 1], k, c5, c5, qa5, ka5, qd5, kd5)
         # T = K' W, U = W M^-1 (M - W): no cancellation where W is large.
         ta, td = scaled(taken(e, L.GAIN_A), wa), scaled(taken(e, L.GAIN_DELTA), wd)
         uaa = wa * (iaa * haa + iad * had + kfa * fa * wa)
@@ -227,8 +245,9 @@ def solve(
     e = stages[n]
     s0 = weights[4] * (e[L.NOW_VX] - e[L.REFERENCE]) + lanes[L.SLOPE_VX, n - 1]
     s1, s2 = lanes[L.SLOPE_VY, n - 1], weights[5] * (e[L.NOW_PSI] - e[L.REFERENCE_HEADING])
-    s3, s4 = 0.0, weights[6] * (e[L.NOW_X] - e[L.REFERENCE_X])
-    s5 = weights[7] * (e[L.NOW_Y] - e[L.REFERENCE_Y])
+    ex, ey = e[L.NOW_X] - e[L.REFERENCE_X], e[L.NOW_Y] - e[L.REFERENCE_Y]
+    s3, s4 = 0.0, lanes[L.PRICE_X, n - 1] * ex + lanes[L.PRICE_CROSS, n - 1] * ey
+    s5 = lanes[L.PRICE_CROSS, n - 1] * ex + lanes[L.PRICE_Y, n - 1] * ey
     ta = td = 0.0
     for i in range(n - 1, -1, -1):
         e = stages[i]
@@ -260,8 +279,9 @@ def solve(
         s0 = f0 + along * e[RATE_VX] - (e[L.GAIN_A] * ma + e[L.GAIN_DELTA] * md)
         s1 = f1 - e[L.GAIN_A + 1] * ma - e[L.GAIN_DELTA + 1] * md
         s2 = f2 - e[L.GAIN_A + 2] * ma - e[L.GAIN_DELTA + 2] * md
-        f4 = weights[2] * share * (e[L.NOW_X] - e[L.REFERENCE_X])
-        f5 = weights[3] * share * (e[L.NOW_Y] - e[L.REFERENCE_Y])
+        ex, ey = e[L.NOW_X] - e[L.REFERENCE_X], e[L.NOW_Y] - e[L.REFERENCE_Y]
+        f4 = lanes[L.PRICE_X, i - 1] * ex + lanes[L.PRICE_CROSS, i - 1] * ey
+        f5 = lanes[L.PRICE_CROSS, i - 1] * ex + lanes[L.PRICE_Y, i - 1] * ey
         s4 += f4 - e[L.GAIN_A + 4] * ma - e[L.GAIN_DELTA + 4] * md
         s5 += f5 - e[L.GAIN_A + 5] * ma - e[L.GAIN_DELTA + 5] * md
     x0 = x1 = x2 = x3 = x4 = x5 = 0.0

@@ -88,8 +88,10 @@ def cost_of(
         offset, e = 4 if i == n else 0, stages[i]
         e0, e1 = e[vx] - e[L.REFERENCE], e[psi] - e[L.REFERENCE_HEADING]
         e2, e3 = e[x] - e[L.REFERENCE_X], e[y] - e[L.REFERENCE_Y]
+        c, s = math.cos(e[L.REFERENCE_HEADING]), math.sin(e[L.REFERENCE_HEADING])
+        along, across = c * e2 + s * e3, c * e3 - s * e2
         error = weights[offset] * e0 * e0 + weights[offset + 1] * e1 * e1
-        error += weights[offset + 2] * e2 * e2 + weights[offset + 3] * e3 * e3
+        error += weights[offset + 2] * along * along + weights[offset + 3] * across * across
         total += error if i == n else shares[i] * error
     before_a, before_delta = last_a, last_delta
     for i in range(n):

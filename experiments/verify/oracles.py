@@ -66,7 +66,7 @@ def plan_cost(
     x, car = rolled_out(problem, state, inputs), problem.vehicle
     q, s, r, r_rate = np.split(weights, (4, 8, 10))
     share = problem.periods[:, None] / NOMINAL_PERIOD
-    error = reference - x[:, [VX, PSI, X, Y]]
+    error = np.einsum("nij,nj->ni", turns(reference), reference - x[:, [VX, PSI, X, Y]])
     tracking = 0.5 * np.sum(share * error[:-1] ** 2 * q) + 0.5 * np.sum(error[-1] ** 2 * s)
     effort = 0.5 * np.sum(share * inputs**2 * r)
     steps = np.diff(np.vstack([last_input, inputs]), axis=0)
@@ -90,6 +90,14 @@ def plan_cost(
     over = [low - inputs, inputs - high, np.abs(steps) - problem.input_steps]
     excess = max(0.0, *(float(values.max()) for values in over))
     return PlanCost(float(tracking + effort + penalty), slack, excess)
+
+
+def turns(reference: Array) -> Array:
+    """Return the matrices (N + 1, 4, 4) that turn errors of position along and across the path."""
+    matrices = np.tile(np.eye(4), (len(reference), 1, 1))
+    c, s = np.cos(reference[:, 1]), np.sin(reference[:, 1])
+    matrices[:, 2, 2], matrices[:, 2, 3], matrices[:, 3, 2], matrices[:, 3, 3] = c, s, -s, c
+    return matrices
 
 
 class CasadiDerivatives:
@@ -199,24 +207,26 @@ class PiqpOracle:
         """Return Hessian (n, n) and gradient (n,)."""
         n, shares = self.problem.horizon, self.problem.periods / NOMINAL_PERIOD
         q, s, r, r_rate = np.split(weights, (4, 8, 10))
+        turned = turns(reference)
         hessian, gradient = np.zeros((n * STAGE, n * STAGE)), np.zeros(n * STAGE)
         for i in range(n):
             u, slack, x = _stage(i)
             outputs = s if i == n - 1 else q * shares[i + 1]
             hessian[u, u] += np.diag(r * shares[i] + self.damping)
             hessian[slack, slack] = np.diag(self.problem.quadratic_penalty) * shares[i]
-            hessian[x, x] = lpv.C.T @ np.diag(outputs) @ lpv.C
+            price = turned[i + 1].T @ np.diag(outputs) @ turned[i + 1]
+            hessian[x, x] = lpv.C.T @ price @ lpv.C
             gradient[u] += -self.damping * inputs[i]
             gradient[slack] = np.array(self.problem.linear_penalty) * shares[i]
-            gradient[x] = -lpv.C.T @ (outputs * reference[i + 1])
-            price = r_rate / (self.problem.spacings[i] * NOMINAL_PERIOD)
-            hessian[u, u] += np.diag(price)
+            gradient[x] = -lpv.C.T @ price @ reference[i + 1]
+            smooth = r_rate / (self.problem.spacings[i] * NOMINAL_PERIOD)
+            hessian[u, u] += np.diag(smooth)
             if i == 0:
-                gradient[u] -= price * last_input
+                gradient[u] -= smooth * last_input
             else:
                 before = _stage(i - 1)[0]
-                hessian[before, before] += np.diag(price)
-                hessian[u, before] = hessian[before, u] = -np.diag(price)
+                hessian[before, before] += np.diag(smooth)
+                hessian[u, before] = hessian[before, u] = -np.diag(smooth)
         return hessian, gradient
 
     def _dynamics(self, inputs: Array, along: Linearisation) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import NOMINAL_PERIOD, NmpcProblem
+from experiments.verify.oracles import turns
 from lpv_track_env.bicycle import PSI, VX, VY, X, Y
 from tests.helpers.nmpc_situations import Situation
 
@@ -44,8 +45,10 @@ class CondensedQp:
         change = np.eye(2 * n) - np.eye(2 * n, k=-2)
         smooth = np.outer(1.0 / (problem.spacings * NOMINAL_PERIOD), weights[10:]).ravel()
         before = np.concatenate([situation.last_input, np.zeros(2 * n - 2)])
-        outputs = influence[:, OUTPUTS].reshape(-1, 2 * n)
-        error = (along.states[:, OUTPUTS] - situation.reference).ravel()
+        turned = turns(situation.reference)
+        outputs = (turned @ influence[:, OUTPUTS]).reshape(-1, 2 * n)
+        error = along.states[:, OUTPUTS] - situation.reference
+        error = np.einsum("nij,nj->ni", turned, error).ravel()
         self.hessian = outputs.T @ (prices[:, None] * outputs)
         self.hessian += np.diag(effort + np.tile(damping, n))
         self.hessian += change.T @ (smooth[:, None] * change)

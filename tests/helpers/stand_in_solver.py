@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from agents.nmpc.casadi_solvers import FatropSolver
 from agents.nmpc.problem import NOMINAL_PERIOD, NmpcProblem, Solution, Status
+from experiments.verify.oracles import turns
 from lpv_track_env.bicycle import derivative
 
 Array = NDArray[np.float64]
@@ -74,7 +75,8 @@ class StandIn:
         for i in range(n):
             influence[i + 1] = along.A[i] @ influence[i]
             influence[i + 1][:, 2 * i : 2 * i + 2] = along.B[i]
-        outputs = influence[1:][:, OUTPUTS].reshape(4 * n, 2 * n)
+        turned = turns(reference)[1:]
+        outputs = (turned @ influence[1:][:, OUTPUTS]).reshape(4 * n, 2 * n)
         shares = problem.periods / NOMINAL_PERIOD
         prices = np.concatenate([np.outer(shares[1:], weights[:4]).ravel(), weights[4:8]])
         effort = np.outer(shares, weights[8:10]).ravel()
@@ -82,7 +84,8 @@ class StandIn:
         unit = np.eye(2 * n)
         change = unit - np.vstack([np.zeros((2, 2 * n)), unit[:-2]])
         before = np.vstack([last_input, inputs[:-1]])
-        error = (reference[1:] - along.states[1:][:, OUTPUTS]).ravel()
+        error = reference[1:] - along.states[1:][:, OUTPUTS]
+        error = np.einsum("nij,nj->ni", turned, error).ravel()
         moves = outputs.T @ (prices[:, None] * outputs)
         moves += np.diag(effort + np.tile(self.damping, n))
         moves += change.T @ (smooth[:, None] * change)

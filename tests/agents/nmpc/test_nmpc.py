@@ -162,6 +162,14 @@ def test_optimum_equals_single_shooting_by_another_solver() -> None:
     q, s, r, r_rate = np.split(WEIGHTS, (4, 8, 10))
     # From the middle of an input to that of the next one, s.
     apart = (0.045, 0.075, 0.1, 0.125, 0.125)
+
+    def errors(node: Array, x: Array) -> Array:
+        """Return the errors of speed and heading, and of position along and across the path."""
+        dx, dy = node[2] - x[4], node[3] - x[5]
+        along = np.array([np.cos(node[1]), np.sin(node[1])])
+        across = np.array([-np.sin(node[1]), np.cos(node[1])])
+        return np.array([node[0] - x[0], node[1] - x[2], along @ [dx, dy], across @ [dx, dy]])
+
     for _ in range(5):
         state, last, reference = random_situation(rng, problem)
 
@@ -170,11 +178,11 @@ def test_optimum_equals_single_shooting_by_another_solver() -> None:
         ) -> float:
             x, before, total = state, last, 0.0
             for k, u in enumerate(flat.reshape(-1, 2)):
-                error, rate = reference[k] - x[[0, 2, 4, 5]], (u - before) / apart[k]
+                error, rate = errors(reference[k], x), (u - before) / apart[k]
                 total += 0.5 * stages[k] / 0.05 * (q @ error**2 + r @ u**2)
                 total += 0.5 * apart[k] / 0.05 * (r_rate @ rate**2)
                 x, before = runge_kutta(x, u, M2_MINIBUS, stages[k], problem.substeps[k]), u
-            error = reference[-1] - x[[0, 2, 4, 5]]
+            error = errors(reference[-1], x)
             return float(total + 0.5 * s @ error**2)
 
         def margins(flat: Array, last: Array = last) -> Array:

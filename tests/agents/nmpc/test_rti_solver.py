@@ -10,7 +10,7 @@ from agents.nmpc.casadi_solvers import IpoptSolver
 from agents.nmpc.problem import LARGEST, NmpcProblem, Solution, Status
 from agents.nmpc.rti_solver import RtiSolver
 from experiments.verify.bench import scaled_error
-from experiments.verify.oracles import plan_cost, rolled_out
+from experiments.verify.oracles import plan_cost, rolled_out, turns
 from lpv_track_env.bicycle import PSI, VX, X, Y
 from lpv_track_env.vehicle import BMW_320I, COURSE_CAR, M2_MINIBUS, VEHICLES, VehicleParameters
 from tests.helpers.condensed_qp import excess
@@ -160,6 +160,7 @@ def test_plans_keep_the_hard_limits_and_are_priced_as_predicted(car: VehiclePara
         assert (slack >= -1e-9).all()
         broken = np.maximum(broken, slack.max(axis=0))
         error = case.reference - states[:, [VX, PSI, X, Y]]
+        error = np.einsum("nij,nj->ni", turns(case.reference), error)
         q, s, r, r_rate = np.split(case.weights, (4, 8, 10))
         share, spacing = problem.periods[:, None] / 0.05, problem.spacings[:, None]
         rates = np.diff(np.vstack([case.last_input, inputs]), axis=0) / spacing
