@@ -30,8 +30,9 @@ def test_windows_are_those_driven_by_hand(name: str, conditions: str | Condition
     choice = CHOICES[name]
     settings = {**CALM, "conditions": conditions, "time_limit": 6.0}
     env, hand = WeightTuningEnv(choice=choice, **settings), ByHand(choice, **settings)
-    env.reset(seed=3)
-    hand.reset(seed=3)
+    # From there the preview, two seconds long, enters another band under each choice of bands.
+    env.reset(seed=5)
+    hand.reset(seed=5)
     lengths, driven = [], 0
     for action in random_actions(choice, 60):
         _, reward, terminated, truncated, info = env.step(action)
