@@ -35,9 +35,9 @@ def main() -> None:
     agent: Any = agents.make("lpv-nmpc", envs.single)
     loop = ClosedLoop(envs, agent)
     default = TrackingWeights().as_array()
-    factors = np.exp(np.random.default_rng(0).normal(0.0, 1.0, (options.candidates, 10)))
-    factors[0] = 1.0  # the default weights are the first candidate
-    factors[:, 8:] = 1.0  # R stays fixed, since only ratios matter
+    factors = np.ones((options.candidates, default.size))  # the first: the default weights
+    random = np.random.default_rng(0)
+    factors[1:, :8] = np.exp(random.normal(0.0, 1.0, (options.candidates - 1, 8)))  # of Q and S
     candidates = default * factors
 
     # Drive d has the same seed for all candidates, so that they differ in their weights alone.
