@@ -70,15 +70,13 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ## Observation space
 
-    `Box(float32, (8 + 2 K,))`: body velocities, yaw rate, actuators, errors and a preview of the
-    reference's curvature and speed over K periods. `lpv_track_env.observation` lists every entry
-    with its unit and sign. Values beyond a bound saturate.
+    `Box(float32, (8 + 2 K,))`: velocities, yaw rate, actuators, errors, and curvature and speed of
+    the reference over K periods, see `lpv_track_env.observation`. Values saturate at their bounds.
 
     ## Reward
 
     Sum of the named terms in `info["reward_terms"]`: progress, lateral, heading, speed, input_rate,
-    end; `lpv_track_env.reward` has formulas and default weights. Perfect tracking gives 1 per
-    second.
+    end, see `lpv_track_env.reward`. Perfect tracking gives 1 per second.
 
     ## Episode end
 
@@ -96,28 +94,23 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     ## Starting state
 
     On the path at its start, at the reference speed, steering straight. `initial_error_range` gives
-    uniformly drawn errors in lateral offset (m), heading (rad) and speed (m/s), at the least
-    standstill unless the vehicle reverses; `random_start` draws the arc length, too.
-    `reset(seed=...)` seeds `self.np_random` and takes one key from it; an episode depends on this
-    key and the episode's number (`lpv_track_env.episodes`). Environment i of a
+    uniformly drawn errors in lateral offset (m), heading (rad) and speed (m/s); `random_start`
+    draws the arc length, too. `reset(seed=...)` seeds `self.np_random` and takes one key from it;
+    an episode depends on this key and its number (`lpv_track_env.episodes`). Environment i of a
     `PathTrackingVectorEnv` reset with seed s therefore equals this one reset with s + i.
 
     `reset(options=...)` takes `trajectory`, `vehicle` (both as in the arguments), `arc_length` (m),
-    `lateral_error` (m), `heading_error` (rad), and `speed_error` or `speed` (m/s). They hold for
-    one episode; the next reset returns to the constructor's arguments. A speed below standstill
-    raises a ValueError unless the vehicle reverses, that is, its `speed_range` begins below 0. Such
-    a vehicle alone drives backwards: the brakes of every other one hold it at standstill.
+    `lateral_error` (m), `heading_error` (rad), and `speed_error` or `speed` (m/s), for one episode.
+    A speed below standstill raises a ValueError, and brakes hold a vehicle there, unless its
+    `speed_range` begins below 0: such a vehicle reverses.
 
     ## Info
 
     `lateral_error, heading_error, speed_error, arc_length, state` (true state, (6,): vx, vy, psi,
-    r, X, Y), `reward_terms, clipped`, and at the end `end`.
-
-    Under conditions other than "simulation" the observation is made from an estimate; rewards and
-    the entries above are still those of the true state. Further entries: `estimate` (6,),
+    r, X, Y), `reward_terms, clipped`, and at the end `end`. Under conditions other than
+    "simulation" the observation is made from an estimate, and there are `estimate` (6,),
     `position_deviation` (m, of the filter in the worst direction; 0 without a filter), `stopping`
-    (the vehicle brakes to a stop, since fixes or commands are overdue) and `deadline_misses` (so
-    far in the episode).
+    (the vehicle brakes, since fixes or commands are overdue) and `deadline_misses` (so far).
 
     ## Arguments
 
@@ -126,13 +119,11 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     vehicle
         A preset's name (`lpv_track_env.vehicle.VEHICLES`), a .json file or `VehicleParameters`.
     speed_mode, fixed_speed
-        "variable": the path's own speed profile. "fixed": one constant speed in m/s, by default the
-        highest that the path's limits allow everywhere.
+        "variable": the path's own speeds. "fixed": one, by default the highest within its limits.
     conditions
         "simulation" (perfect actuators, sensors, knowledge of the vehicle), "realtime" (our model
         of a vehicle's runs), a `lpv_track_env.conditions.Conditions`, or a dictionary of its
-        fields, e.g. `{"name": "realtime", "estimator": "raw"}`. Ranges are drawn anew for every
-        episode.
+        fields, e.g. `{"name": "realtime", "estimator": "raw"}`.
     control_period
         s; the dynamics are integrated with fixed Runge-Kutta steps of at most 5 ms within it.
     preview_steps, preview_period
@@ -144,10 +135,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     time_limit
         s; by default one and a half times the path's duration plus 10 s.
     plant
-        Model of the driven vehicle: "bicycle", or a model by others (`lpv_track_env.plants`):
-        "single-track", "drift", "multi-body", for the vehicles `ford-escort`, `bmw-320i`,
-        `vw-vanagon`; or a function of `VehicleParameters` that returns a `Plant`. A step with these
-        takes 20 to 200 times as long, more below 2 m/s.
+        Model of the driven vehicle: "bicycle", a model by others (`lpv_track_env.plants`), or a
+        function of `VehicleParameters` that returns a `Plant`.
     render_colour
         Colour of the path in frames: by "speed", the reference's, or by "curvature".
 
@@ -217,12 +206,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._open_views()
         self._use(self.base_task, self._plant_of(self.base_task))
         if self._plant is not None and self._nominal_friction < self.friction == math.inf:
-            warnings.warn(
-                f"conditions: friction has no effect on plant {shown(plant)}, whose tyres have no "
-                "such limit",
-                UserWarning,
-                stacklevel=3,
-            )
+            message = f"conditions: friction has no effect on plant {shown(plant)}: linear tyres"
+            warnings.warn(message, UserWarning, stacklevel=3)
 
     def _open_views(self) -> None:
         """Make views of the episode's array once, since making one takes as long as a copy."""

@@ -148,7 +148,7 @@ def test_without_offsets_the_two_of_a_pair_are_one_drive(monkeypatch: pytest.Mon
     still = np.random.default_rng(0)
     monkeypatch.setattr(np.random, "default_rng", lambda _: Still(still))
     scores = tuner.step()
-    assert scores["score"] == scores["best"]
+    assert scores["score"] == pytest.approx(scores["best"], rel=1e-12)  # means of the same drives
     assert np.concatenate(seen).size == 2 * 4
     np.testing.assert_array_equal(np.concatenate(seen), 0.0)
 

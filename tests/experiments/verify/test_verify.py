@@ -73,9 +73,18 @@ def test_cost_of_one_straight_period_by_hand() -> None:
     reference = np.array([[10.5, 0.1, 0.2, 0.3], [11.0, 0.2, 1.2, 0.5]])
     last = np.array([a - 0.3, 0.02])
     price = plan_cost(problem, state, last, reference, weights, np.array([[a, 0.0]]))
+
     # v: 10 to 10.1 m/s; x: 0 to 1.005 m
-    stage = 2 * 0.5**2 + 3 * 0.1**2 + 5 * 0.2**2 + 7 * 0.3**2
-    end = 11 * 0.9**2 + 13 * 0.2**2 + 17 * 0.195**2 + 19 * 0.5**2
+    def across(x: float, y: float, heading: float) -> float:
+        return y * np.cos(heading) - x * np.sin(heading)
+
+    def along(x: float, y: float, heading: float) -> float:
+        return x * np.cos(heading) + y * np.sin(heading)
+
+    stage = 2 * 0.5**2 + 3 * 0.1**2
+    stage += 5 * along(0.2, 0.3, 0.1) ** 2 + 7 * across(0.2, 0.3, 0.1) ** 2
+    end = 11 * 0.9**2 + 13 * 0.2**2
+    end += 17 * along(0.195, 0.5, 0.2) ** 2 + 19 * across(0.195, 0.5, 0.2) ** 2
     # A stage of 0.1 s counts twice; 3 m/s^3 and -0.2 rad/s last as long.
     rates = 0.31 * 3.0**2 + 0.37 * 0.2**2
     cost = 0.5 * (2.0 * (stage + 23 * a**2 + rates) + end)
@@ -116,7 +125,7 @@ def test_cost_of_two_unequal_stages_by_hand() -> None:
 
 
 def test_sideslip_and_slow_speed_break_theirs() -> None:
-    problem, state = straight(0.5)
+    problem, state = NmpcProblem(M2_MINIBUS, horizon=1, period=0.01), straight(0.5)[1]
     state[1] = 3.0
     inputs = np.array([[M2_MINIBUS.rolling_deceleration, 0.0]])
     price = plan_cost(problem, state, inputs[0], np.zeros((2, 4)), NO_COST, inputs)

@@ -363,4 +363,6 @@ def test_the_nmpc_creeps_where_its_vehicle_may_stop(name: str, speed: float) -> 
         observation, *_, info = env.step(action)
         speeds.append(info["state"][0])
     assert min(speeds) > -1e-3
-    assert speeds[-1] == pytest.approx(speed, abs=0.01)
+    # The weight on a, which rolling resistance needs, costs about 1 cm/s of speed.
+    assert speeds[-1] == pytest.approx(speed, abs=0.02)
+    assert abs(speeds[-1] - speeds[-40]) < 1e-3
