@@ -37,9 +37,8 @@ class TrackingWeights:
     steering rate]; `agents.nmpc.problem` has units.
 
     Only their ratios affect the plan. The defaults track all six trajectories within centimetres.
-    Heading has a tenth of the weight of lateral position: a car drives through a bend with
-    sideslip, so a heading error of zero would cost lateral error. Position along the path has a
-    hundredth: a car that the limit on vx' holds back would steer to gain on it.
+    Heading has a tenth of the weight of position: a car drives through a bend with sideslip, so a
+    heading error of zero would cost lateral error.
 
     Raises
     ------
@@ -47,8 +46,8 @@ class TrackingWeights:
         For a wrong number of weights, or one that is negative or not finite.
     """
 
-    Q: tuple[float, float, float, float] = (1.0, 1.0, 0.1, 10.0)
-    S: tuple[float, float, float, float] = (5.0, 5.0, 0.5, 50.0)
+    Q: tuple[float, float, float, float] = (1.0, 1.0, 10.0, 10.0)
+    S: tuple[float, float, float, float] = (5.0, 5.0, 50.0, 50.0)
     R: tuple[float, float] = (0.01, 1.0)
     R_rate: tuple[float, float] = (0.001, 0.06)
 

@@ -75,8 +75,8 @@ class NmpcSettings:
     weights: TrackingWeights | WeightSchedule | Mapping[str, Any] | str | Path | None = None
     selection: str = "band"
     model: VehicleParameters | None = None
-    linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0)
-    quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0)
+    linear_penalty: tuple[float, float, float] = (20.0, 20.0, 0.0)
+    quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 5.0)
     friction: float | str = "known"
     max_failures: int = 10
 

@@ -87,7 +87,8 @@ class NmpcProblem:
         Time until the next plan, s, over which the change of the first input is bounded; by default
         the first stage's length.
     linear_penalty, quadratic_penalty
-        Penalties of slack on (vx m/s, vy m/s, vx' m/s^2), shape (3,).
+        Penalties of slack on (vx m/s, vy m/s, vx' m/s^2), shape (3,). That on vx' is small: a car
+        that it holds back from its place along the path would steer to gain on it.
     friction
         Coefficient of friction of the model's tyres (`lpv_track_env.tyres`); inf makes them linear.
 
@@ -103,8 +104,8 @@ class NmpcProblem:
     period: float = 0.1
     stages: tuple[float, ...] | None = None
     first_period: float | None = None
-    linear_penalty: tuple[float, float, float] = (20.0, 20.0, 20.0)
-    quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 100.0)
+    linear_penalty: tuple[float, float, float] = (20.0, 20.0, 0.0)
+    quadratic_penalty: tuple[float, float, float] = (100.0, 100.0, 5.0)
     friction: float = math.inf
 
     def __post_init__(self) -> None:
