@@ -11,6 +11,7 @@ period. Each stage then adds a Hessian and a gradient to the Riccati
 recursion. Pairs and arrays are described in `layout`.
 """
 
+import math
 from typing import Any
 
 from numpy.typing import NDArray
@@ -53,7 +54,10 @@ def initialise(lanes: Array, constants: Array) -> Float:
         for soft in range(3):
             first = 8 + 3 * soft
             high, low = lanes[L.GAP + first, i], lanes[L.GAP + first + 1, i]
-            least = START_BARRIER / (constants[L.LINEAR + soft] * shares[i] + 1e-3)
+            # The slack whose product with the slope of its penalty is the barrier.
+            linear = constants[L.LINEAR + soft] * shares[i]
+            curved = 4.0 * START_BARRIER * constants[L.QUADRATIC + soft] * shares[i]
+            least = 2.0 * START_BARRIER / (linear + math.sqrt(linear * linear + curved) + 1e-3)
             slack = max(-min(high, low), 0.0) + least
             lanes[L.T + first, i], lanes[L.T + first + 1, i] = high + slack, low + slack
             lanes[L.T + first + 2, i] = slack

@@ -142,17 +142,25 @@ def test_random_paths_are_drivable(
 
 @given(seed=st.integers(0, 2**63))
 @settings(max_examples=10, deadline=None)
-def test_limit_paths_use_the_grip_of_their_seed(seed: int) -> None:
+def test_limit_paths_stay_within_the_grip_of_their_seed(seed: int) -> None:
     path = load(f"random-limit-{seed}")
     check_contract(path, f"random-limit-{seed}")
     assert np.abs(path.curvature).max() < STEERABLE
     grip = 0.5 + 0.05 * (seed % 10)
     assert path.metadata["grip"] == pytest.approx(grip, abs=1e-12)
     lateral = path.speed**2 * np.abs(path.curvature) / GRAVITY
-    assert lateral.max() == pytest.approx(grip, rel=0.02)
+    assert lateral.max() <= 1.02 * grip
     assert np.hypot(path.acceleration / GRAVITY, lateral).max() <= 1.01 * grip
     assert -3.0 * 1.005 <= path.acceleration.min() < path.acceleration.max() <= 2.0 * 1.005
     assert path.speed[[0, -1]] == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_limit_paths_use_their_grip(seed: int) -> None:
+    """Those of the suite; the speeds of others may be bounded by other limits all along."""
+    path = load(f"random-limit-{seed}")
+    lateral = path.speed**2 * np.abs(path.curvature) / GRAVITY
+    assert lateral.max() == pytest.approx(0.5 + 0.05 * seed, rel=0.02)
 
 
 def test_a_section_is_the_part_of_the_path() -> None:

@@ -157,7 +157,9 @@ def test_plan_keeps_every_constraint_and_the_dynamics(
 def test_optimum_equals_single_shooting_by_another_solver() -> None:
     """SciPy's SLSQP on inputs alone, with NumPy's dynamics, finds the same plan."""
     stages = (0.05, 0.1, 0.1, 0.15, 0.1)
-    problem = NmpcProblem(M2_MINIBUS, horizon=5, stages=stages, first_period=0.04)
+    problem = NmpcProblem(
+        M2_MINIBUS, horizon=5, stages=stages, first_period=0.04, linear_penalty=(20.0, 20.0, 20.0)
+    )
     solver, rng = IpoptSolver(problem, tolerance=1e-10), np.random.default_rng(2)
     q, s, r, r_rate = np.split(WEIGHTS, (4, 8, 10))
     # From the middle of an input to that of the next one, s.
