@@ -24,7 +24,8 @@ R_rate, which it has not.
 
 A soft constraint may be violated by a slack s >= 0 at a cost of linear s + 1/2 quadratic s^2. This
 penalty is exact for multipliers below `linear`, so slack is used only where the path demands the
-impossible (the limit on vy alone bounds the curvature, see the errata).
+impossible (the limit on vy alone bounds the curvature, see the errata). On vx' `linear` is 0 by
+default: this limit gives way a little.
 """
 
 import math

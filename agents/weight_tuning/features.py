@@ -76,7 +76,7 @@ HISTORY = SLOW + COUNT
 LIMIT = 5.0
 """Bound of every feature."""
 TUNED = 8
-"""Number of weights that are chosen: Q and S. Only ratios matter, so R is fixed."""
+"""Number of weights that are chosen: Q and S. R and R_rate are fixed."""
 QUARTERS = 4
 """Number of parts of the preview with a feature each for their largest curvature."""
 SCALES = np.array([0.05, 0.05, 0.5, 0.02, 0.01, 0.02, 0.5, 0.2, 2.0, 0.2])
@@ -166,7 +166,7 @@ def update_history(h: Array, o: Array, a: Any, delta: Any, period: Any) -> None:
     h[SEEN] += 1.0
     h[AGE] = 0.0
     h[LAST], h[LAST + 1], h[LAST + 2], h[LAST + 3] = lateral, heading, vx, vy
-    # The first curvature of the preview is that of the coming period.
+    # The first curvature of the preview is the mean over its first interval, from here on.
     h[LAST + 4] = r - o[PREVIEW_START] * vx
     h[LAST + 5], h[LAST + 6] = now_a, now_delta
 

@@ -27,7 +27,7 @@ LIMIT_PATHS = tuple(f"random-limit-{seed}" for seed in range(100))
 BESIDE = {"initial_error_range": [0.3, 0.1, 0.5]}
 """Start beside the path; in simulation, a seed changes nothing else."""
 LEARNED = ("ppo", "sac", "bc")
-"""Shipped policies; their preview of 1 s is too short to cut the corners of raw waypoints."""
+"""Shipped policies; their preview of 2 s is too short to cut the corners of raw waypoints."""
 DEMONSTRATION = "lpv-mpc-frozen"
 """Agent that shows why the frozen form must not be used."""
 
@@ -170,7 +170,7 @@ def paper(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
     """The paper's six in both speed modes, as raw waypoints, with another vehicle, in real time.
 
     To cut a corner of raw waypoints an agent must see it 3 s ahead, so agents get 30 preview steps
-    of 0.1 s there, and learned policies, trained for 1 s, are left out. IPOPT's NMPC takes a
+    of 0.1 s there, and learned policies, trained for 2 s, are left out. IPOPT's NMPC takes a
     hundred times as long as all others together and drives the six at variable speed alone;
     `converged` has the rest.
     """
