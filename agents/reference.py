@@ -125,26 +125,32 @@ def local_reference(
 
 
 @compiled_internal
+def along_arc(c: Any, d: Any, x: Any, y: Any, curvature: Any, length: Any) -> Any:
+    """Move on by an arc: return the new direction (c, d), position x, y (m) and the turn (rad)."""
+    half = 0.5 * curvature * length
+    ch, sh = math.cos(half), math.sin(half)
+    chord = length if abs(half) < 1e-9 else length * sh / half
+    # The chord has the direction at the middle of the arc.
+    c, d = c * ch - d * sh, d * ch + c * sh
+    x, y = x + chord * c, y + chord * d
+    return c * ch - d * sh, d * ch + c * sh, x, y, 2.0 * half
+
+
+@compiled_internal
 def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, nodes: Array) -> None:
     """Fill nodes (n + 1, NODE) from the first n intervals of one preview."""
     s = x = y = heading = 0.0
     before = first_speed
-    # Direction of the path at the node before, turned in two halves of an interval's angle.
+    # Direction of the path at the node before.
     c, d = 1.0, 0.0
     nodes[0, NODE_SPEED], nodes[0, NODE_HEADING], nodes[0, NODE_X] = first_speed, 0.0, 0.0
     nodes[0, NODE_Y], nodes[0, NODE_ARC_LENGTH] = 0.0, 0.0
     for k in range(nodes.shape[0] - 1):
         after = float(speed[k])
         length = 0.5 * (before + after) * period
-        half = 0.5 * curvature[k] * length
-        ch, sh = math.cos(half), math.sin(half)
-        chord = length if abs(half) < 1e-9 else length * sh / half
-        c, d = c * ch - d * sh, d * ch + c * sh
+        c, d, x, y, turn = along_arc(c, d, x, y, curvature[k], length)
         s += length
-        x += chord * c
-        y += chord * d
-        heading += 2.0 * half
-        c, d = c * ch - d * sh, d * ch + c * sh
+        heading += turn
         before = after
         nodes[k + 1, NODE_SPEED], nodes[k + 1, NODE_HEADING] = after, heading
         nodes[k + 1, NODE_X], nodes[k + 1, NODE_Y], nodes[k + 1, NODE_ARC_LENGTH] = x, y, s
@@ -183,15 +189,9 @@ def fill_nodes_at(
             if at > last:
                 step, after = rest, v
             length = 0.5 * (v + after) * step
-            half = 0.5 * curvature[interval] * length
-            ch, sh = math.cos(half), math.sin(half)
-            chord = length if abs(half) < 1e-9 else length * sh / half
-            c, d = c * ch - d * sh, d * ch + c * sh
+            c, d, x, y, turn = along_arc(c, d, x, y, curvature[interval], length)
             s += length
-            x += chord * c
-            y += chord * d
-            heading += 2.0 * half
-            c, d = c * ch - d * sh, d * ch + c * sh
+            heading += turn
             v, rest, left = after, rest - step, left - step
             if left <= 1e-9:
                 at, left = at + 1, period

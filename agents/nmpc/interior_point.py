@@ -7,8 +7,8 @@ the multiplier after a step of length zero, its step is
     ds = (sum b - linear - quadratic s - sum w dgap) / (quadratic + sum w)
 
 over its pairs and its own bound, with both penalties multiplied by the stage's share of the nominal
-period. Each stage then adds a Hessian and a gradient to the Riccati
-recursion. Pairs and arrays are described in `layout`.
+period. Each stage then adds a Hessian and a gradient to the Riccati recursion. Pairs and arrays are
+described in `layout`.
 """
 
 import math
@@ -93,21 +93,13 @@ def fill_hessian(lanes: Array, constants: Array) -> None:
         bottom = 1.0 / (quadratic + w1 + w2 + w3)
         vx = ((w1 + w2) * (quadratic + w3) + 4.0 * w1 * w2) * bottom
         lanes[L.BOTTOM, i] = bottom
-        w1, w2, w3, quadratic = (
-            w[11, i],
-            w[12, i],
-            w[13, i],
-            constants[L.QUADRATIC_RATE] * shares[i],
-        )
+        w1, w2, w3 = w[11, i], w[12, i], w[13, i]
+        quadratic = constants[L.QUADRATIC_RATE] * shares[i]
         bottom = 1.0 / (quadratic + w1 + w2 + w3)
         lanes[L.BARRIER_RATE, i] = ((w1 + w2) * (quadratic + w3) + 4.0 * w1 * w2) * bottom
         lanes[L.BOTTOM_RATE, i] = bottom
-        w1, w2, w3, quadratic = (
-            w[14, i],
-            w[15, i],
-            w[16, i],
-            constants[L.QUADRATIC_RATIO] * shares[i],
-        )
+        w1, w2, w3 = w[14, i], w[15, i], w[16, i]
+        quadratic = constants[L.QUADRATIC_RATIO] * shares[i]
         bottom = 1.0 / (quadratic + w1 + w2 + w3)
         apart = (quadratic + w3) * bottom
         lanes[L.BARRIER_VX, i] = vx + ratio * ratio * (w1 + w2) * apart

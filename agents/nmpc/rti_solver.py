@@ -176,7 +176,7 @@ class RtiSolver:
         length.
     steps_by_speed
         Take as few Runge-Kutta steps a stage as resolve the lateral dynamics at its speed, instead
-        of those for the lowest permitted speed. The model is then not smooth in the speed, so only
+        of those that are stable at standstill. The model is then not smooth in the speed, so only
         single iterations make use of it.
 
     Raises

@@ -87,8 +87,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
 def limits_of(path: "ReferencePath", given: Mapping[str, Any]) -> "SpeedLimits":
     """Return the limits of a plan: those given by name, and the path's own for the others.
 
-    `grip` is a share of g that bounds the lateral acceleration, and the total one, so that who
-    brakes in a turn stays within the circle of friction.
+    `grip` is a share of g that bounds the lateral acceleration and the total one, so that braking
+    in a turn stays within the friction circle.
 
     Raises
     ------
