@@ -26,24 +26,26 @@ from agents.reference import (
     fill_nodes,
 )
 from lpv_track_env import observation as entry
+from lpv_track_env import tyres
 from lpv_track_env.bicycle import longest_substep
 from lpv_track_env.conditions import Actuation
-from lpv_track_env.integration import integrate
+from lpv_track_env.integration import integrate_with
 from lpv_track_env.kernels import wrap
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.compilation import compiled, compiled_internal
 
 Array = NDArray[Any]
 
-# Settings of the prediction, (SETTINGS,) float64: times in s, then the model's 7 parameters and its
-# lowest speed (m/s).
+# Settings of the prediction, (SETTINGS,) float64: times in s, then the model's 7 parameters, its
+# lowest speed (m/s) and the constants of its tyres (`tyres.constants`).
 (
     DRIVE_DELAY, DRIVE_LAG, STEERING_DELAY, STEERING_LAG, HORIZON, DRIVE_HORIZON, PERIOD,
     PREVIEW_PERIOD, SUBSTEP,
 ) = range(9)  # fmt: skip
 MODEL = 9
 LOWEST_SPEED = MODEL + 7
-SETTINGS = LOWEST_SPEED + 1
+TYRE = LOWEST_SPEED + 1
+SETTINGS = TYRE + 6
 
 FOOT = 3
 """Pose of the new foot point in the frame of the old one: x, y, heading."""
@@ -71,7 +73,8 @@ def drive_on(
     h = (ends - begins) / steps
     kept_a = math.exp(-h / p[DRIVE_LAG]) if p[DRIVE_LAG] > 0.0 else 0.0
     kept_delta = math.exp(-h / p[STEERING_LAG]) if p[STEERING_LAG] > 0.0 else 0.0
-    m = MODEL
+    m, t = MODEL, TYRE
+    tyre = p[t], p[t + 1], p[t + 2], p[t + 3], p[t + 4], p[t + 5]
     for i in range(steps):
         # At time t a command sent at t - delay, so `delay - t` ago, comes into force.
         middle = begins + (i + 0.5) * h
@@ -83,9 +86,9 @@ def drive_on(
         )
         a = wanted_a + (a - wanted_a) * kept_a
         delta = wanted_delta + (delta - wanted_delta) * kept_delta
-        vx, vy, psi, r, x, y = integrate(
+        vx, vy, psi, r, x, y = integrate_with(
             vx, vy, psi, r, x, y, mean_a, mean_delta,
-            p[m], p[m + 1], p[m + 2], p[m + 3], p[m + 4], p[m + 5], p[m + 6], h, 1,
+            p[m], p[m + 1], p[m + 2], p[m + 3], p[m + 4], p[m + 5], p[m + 6], tyre, h, 1,
             p[LOWEST_SPEED],
         )  # fmt: skip
     return vx, vy, psi, r, x, y, a, delta
@@ -272,7 +275,8 @@ class DelayRow:
 class NearFuture:
     """Predictor of observations to the time at which the next action takes effect.
 
-    It only uses nominal delays and lags, the centres of their ranges, not those of the episode.
+    It only uses nominal delays, lags and friction, the centres of their ranges, not those of the
+    episode.
 
     Parameters
     ----------
@@ -303,6 +307,7 @@ class NearFuture:
                 longest_substep(vehicle),
                 *vehicle.as_array(),
                 vehicle.lowest_speed,
+                *tyres.of(vehicle, task.friction),
             ]
         )
         self.kept = math.ceil(max(drive, steering) / task.control_period) + 1

@@ -227,7 +227,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._conditioned = None
         if task.conditions is not None:
             self._conditioned = ConditionedVehicle.of(
-                task.conditions, task.vehicle, task.control_period
+                task.conditions, task.vehicle, task.control_period, self.friction
             )
         self._take_table(task.path.table)
 

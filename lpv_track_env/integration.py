@@ -179,3 +179,22 @@ def integrate_sliding(
         vx, vy, psi, r, x, y, ax, delta, p0, p1, p2, p3, p4, p5, p6, nf, nr, h, substeps, lowest,
         True,
     )  # fmt: skip
+
+
+@compiled_internal
+def integrate_with(
+    vx: Any, vy: Any, psi: Any, r: Any, x: Any, y: Any, a: Any, delta: Any,
+    p0: Any, p1: Any, p2: Any, p3: Any, p4: Any, p5: Any, p6: Any, tyre: Any, h: Any, substeps: int,
+    lowest: Any = -math.inf,
+) -> tuple[Any, Any, Any, Any, Any, Any]:  # fmt: skip
+    """Return what `integrate_sliding` does if the friction is limited, else what `integrate` does.
+
+    `tyre` are the `tyres.constants`.
+    """
+    if tyre[1] < math.inf:
+        return integrate_sliding(
+            vx, vy, psi, r, x, y, a, delta, p0, p1, p2, p3, p4, p5, p6, tyre, h, substeps, lowest
+        )
+    return integrate(
+        vx, vy, psi, r, x, y, a, delta, p0, p1, p2, p3, p4, p5, p6, h, substeps, lowest
+    )

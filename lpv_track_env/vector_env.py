@@ -196,7 +196,10 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         if self.condition_arrays is not None:
             given = tasks[0].conditions
             assert given is not None
-            specs = [layout.spec_of(given, task.vehicle, task.control_period) for task in tasks]
+            friction = self.single.friction
+            specs = [
+                layout.spec_of(given, task.vehicle, task.control_period, friction) for task in tasks
+            ]
             self.condition_arrays = self.condition_arrays._replace(specs=np.stack(specs))
 
     def task_of(self, index: int) -> Task:

@@ -52,6 +52,7 @@ class Ekf:
             vehicle.load(setup.vehicle),
             setup.known_conditions.filter_settings,
             period=setup.tick_ms / MS_PER_SECOND,
+            friction=setup.known_conditions.middle("friction"),
         )
         self._begun = False
 

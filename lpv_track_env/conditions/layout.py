@@ -110,8 +110,13 @@ def vehicle_size(conditions: Conditions, period: float) -> int:
     return TAIL + COMMAND * commands + FIX * fixes + filtering.FILTER + filtering.NODE * nodes
 
 
-def spec_of(conditions: Conditions, vehicle: VehicleParameters, period: float) -> Array:
-    """Return the spec of a vehicle under some conditions and a control period (s), (SPEC,)."""
+def spec_of(
+    conditions: Conditions, vehicle: VehicleParameters, period: float, friction: float
+) -> Array:
+    """Return the spec of a vehicle under some conditions and a control period (s), (SPEC,).
+
+    `friction` is the nominal one, that of the filter's model.
+    """
     age = conditions.max_command_age
     commands, fixes, _ = capacities(conditions, period)
     return np.concatenate(
@@ -127,7 +132,7 @@ def spec_of(conditions: Conditions, vehicle: VehicleParameters, period: float) -
                 fixes,
             ],
             conditions.filter_settings.initial_variances,
-            conditions.filter_settings.as_array(vehicle),
+            conditions.filter_settings.as_array(vehicle, friction),
         ]
     )
 
@@ -142,12 +147,12 @@ class ConditionedVehicle(NamedTuple):
 
     @classmethod
     def of(
-        cls, conditions: Conditions, vehicle: VehicleParameters, period: float
+        cls, conditions: Conditions, vehicle: VehicleParameters, period: float, friction: float
     ) -> "ConditionedVehicle":
-        """Return new arrays for a vehicle under some conditions and a control period (s)."""
+        """Return new arrays; the arguments are those of `spec_of`."""
         return cls(
             np.zeros(vehicle_size(conditions, period)),
-            spec_of(conditions, vehicle, period),
+            spec_of(conditions, vehicle, period, friction),
             np.zeros(filtering.WORK),
         )
 

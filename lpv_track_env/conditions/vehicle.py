@@ -9,7 +9,7 @@ from lpv_track_env import kernels as k
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.conditions import WIND_LEVER, layout
 from lpv_track_env.draws import gaussian
-from lpv_track_env.integration import integrate, integrate_sliding
+from lpv_track_env.integration import integrate_with
 from lpv_track_env.tyres import compiled_constants
 from trajectories.compilation import compiled_in_place, compiled_internal
 
@@ -162,7 +162,6 @@ def drive_vehicle(
     h = p[k.PERIOD] / substeps
     vx, vy, psi, r = record[VX], record[VY], record[PSI], record[YAW_RATE]
     x, y = record[X], record[Y]
-    slides = m[layout.FRICTION] < math.inf
     tyre = compiled_constants(
         m[layout.FRICTION], p[k.HEIGHT], m[q], m[q + 2], m[q + 3], m[q + 4], m[q + 5]
     )
@@ -181,18 +180,11 @@ def drive_vehicle(
         # Half of the wind's impulse before the step and half after it: Strang splitting, order 2.
         vy += 0.5 * h * push
         r += 0.5 * h * spin
-        if slides:
-            vx, vy, psi, r, x, y = integrate_sliding(
-                vx, vy, psi, r, x, y, a, delta,
-                m[q], m[q + 1], m[q + 2], m[q + 3], m[q + 4], m[q + 5], m[q + 6], tyre, h, 1,
-                p[k.LOWEST_SPEED],
-            )  # fmt: skip
-        else:
-            vx, vy, psi, r, x, y = integrate(
-                vx, vy, psi, r, x, y, a, delta,
-                m[q], m[q + 1], m[q + 2], m[q + 3], m[q + 4], m[q + 5], m[q + 6], h, 1,
-                p[k.LOWEST_SPEED],
-            )  # fmt: skip
+        vx, vy, psi, r, x, y = integrate_with(
+            vx, vy, psi, r, x, y, a, delta,
+            m[q], m[q + 1], m[q + 2], m[q + 3], m[q + 4], m[q + 5], m[q + 6], tyre, h, 1,
+            p[k.LOWEST_SPEED],
+        )  # fmt: skip
         vy += 0.5 * h * push
         r += 0.5 * h * spin
     m[layout.MEAN_A], m[layout.MEAN_DELTA] = total_a / substeps, total_delta / substeps

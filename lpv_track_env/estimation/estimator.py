@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from lpv_track_env import tyres
 from lpv_track_env.bicycle import PSI, longest_substep
 from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.vehicle import VehicleParameters
@@ -88,8 +89,11 @@ class EstimatorSettings:
         }
         check_fields(self, rules, prefix="estimator: ")
 
-    def as_array(self, vehicle: VehicleParameters) -> Array:
-        """Return the settings of the kernels, shape (`filter.SETTINGS`,)."""
+    def as_array(self, vehicle: VehicleParameters, friction: float = math.inf) -> Array:
+        """Return the settings of the kernels, shape (`filter.SETTINGS`,), for a vehicle's model.
+
+        `friction` is the coefficient of its tyres; inf makes them linear.
+        """
         return np.array(
             [
                 self.position_deviation**2,
@@ -110,6 +114,7 @@ class EstimatorSettings:
                 longest_substep(vehicle),
                 *vehicle.as_array(),
                 vehicle.lowest_speed,
+                *tyres.of(vehicle, friction),
             ]
         )
 
@@ -145,6 +150,13 @@ class Estimator:
     period
         Expected time between calls of `advance`, s, which sizes the filter's past; calls may come
         at any time.
+    friction
+        Coefficient of friction of the model's tyres (`lpv_track_env.tyres`); inf makes them linear.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of its range.
 
     Examples
     --------
@@ -162,11 +174,12 @@ class Estimator:
         *,
         period: float = 0.02,
         memory: float = 0.3,
+        friction: float = math.inf,
     ) -> None:
         if not (0.0 < period <= memory < math.inf):
             raise ValueError(f"period and memory must be 0 < {period} <= {memory} s")
         self.vehicle, self.settings = vehicle, settings or EstimatorSettings()
-        self._settings = self.settings.as_array(vehicle)
+        self._settings = self.settings.as_array(vehicle, tyres.FRICTION.of("friction", friction))
         nodes = math.ceil(memory / period - 1e-9) + 1
         self._filter = np.zeros(filtering.FILTER + nodes * filtering.NODE)
         self._work = np.zeros(filtering.WORK)

@@ -20,7 +20,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, compiled_inverse_speed
-from lpv_track_env.integration import integrate
+from lpv_track_env.integration import integrate_with
 from lpv_track_env.kernels import wrap
 from trajectories.compilation import compiled, compiled_internal
 
@@ -56,11 +56,12 @@ POSITION_VARIANCE, HEADING_VARIANCE, YAW_RATE_VARIANCE, SPEED_VARIANCE = range(4
 VX_DENSITY, VY_DENSITY, PSI_DENSITY, R_DENSITY, POSITION_DENSITY = 4, 5, 6, 7, 8
 GYRO_DENSITY, HEADING_BIAS_DENSITY, OFFSET_DENSITY = 9, 10, 11
 # gates on the NIS of a fix (2 degrees of freedom) and of a reading (1), rejections in a row after
-# which a reading is used nevertheless, the prediction's step (s), the vehicle's 7 parameters and
-# its lowest speed (m/s).
+# which a reading is used nevertheless, the prediction's step (s), the vehicle's 7 parameters, its
+# lowest speed (m/s), and the constants of its tyres (`tyres.constants`).
 FIX_GATE, READING_GATE, MOST_IN_A_ROW, SUBSTEP, PARAMETERS = 12, 13, 14, 15, 16
 LOWEST_SPEED = PARAMETERS + 7
-SETTINGS = LOWEST_SPEED + 1
+TYRE = LOWEST_SPEED + 1
+SETTINGS = TYRE + 6
 
 USED, GATED, LATE, DUPLICATE, NOT_FINITE = range(5)
 FIX_RESULTS = ("used", "gated", "late", "duplicate", "not finite")
@@ -111,22 +112,25 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
         s[PARAMETERS], s[PARAMETERS + 1], s[PARAMETERS + 2], s[PARAMETERS + 3],
         s[PARAMETERS + 4], s[PARAMETERS + 5], s[PARAMETERS + 6],
     )  # fmt: skip
+    t = TYRE
+    tyre = s[t], s[t + 1], s[t + 2], s[t + 3], s[t + 4], s[t + 5]
     substeps = max(math.ceil(dt / s[SUBSTEP] - 1e-9), 1)
     h = dt / substeps
     vx, vy, psi, r = m[VX], m[VY], m[PSI], m[YAW_RATE]
     wheels = delta + m[STEERING_OFFSET]
     # In the frame of the vehicle at the start: its heading only turns the result.
-    nx, ny, turn, nr, ahead, aside = integrate(
-        vx, vy, 0.0, r, 0.0, 0.0, a, wheels, p0, p1, p2, p3, p4, p5, p6, h, substeps,
+    nx, ny, turn, nr, ahead, aside = integrate_with(
+        vx, vy, 0.0, r, 0.0, 0.0, a, wheels, p0, p1, p2, p3, p4, p5, p6, tyre, h, substeps,
         s[LOWEST_SPEED],
     )  # fmt: skip
     # The Jacobian needs fewer steps, enough to resolve the lateral poles; their sum bounds each.
+    # Limited tyres slow them.
     q = compiled_inverse_speed(vx)
     poles = q * ((p4 + p5) / p0 + (p4 * p2 * p2 + p5 * p3 * p3) / p1)
     few = min(max(math.ceil(poles * dt / JACOBIAN_STEP), 1), substeps)
     h = dt / few
-    bx, by, bent, br, along, across = integrate(
-        vx, vy, 0.0, r, 0.0, 0.0, a, wheels, p0, p1, p2, p3, p4, p5, p6, h, few
+    bx, by, bent, br, along, across = integrate_with(
+        vx, vy, 0.0, r, 0.0, 0.0, a, wheels, p0, p1, p2, p3, p4, p5, p6, tyre, h, few
     )
     c, sn = math.cos(psi), math.sin(psi)
     f = work[:ENTRIES]
@@ -136,10 +140,10 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
         f[k * STATES + k] = 1.0
     for k in range(4):
         step = DIFFERENCES[k]
-        dvx, dvy, dturn, dr, dahead, daside = integrate(
+        dvx, dvy, dturn, dr, dahead, daside = integrate_with(
             vx + (step if k == 0 else 0.0), vy + (step if k == 1 else 0.0), 0.0,
             r + (step if k == 2 else 0.0), 0.0, 0.0, a, wheels + (step if k == 3 else 0.0),
-            p0, p1, p2, p3, p4, p5, p6, h, few,
+            p0, p1, p2, p3, p4, p5, p6, tyre, h, few,
         )  # fmt: skip
         column = VX if k == 0 else VY if k == 1 else YAW_RATE if k == 2 else STEERING_OFFSET
         per = 1.0 / step

@@ -1,5 +1,7 @@
 """Delay compensation: the near future that is shown is the one that comes."""
 
+import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -8,7 +10,7 @@ from numpy.typing import NDArray
 
 import agents
 from agents.base import DrivingTask
-from agents.delay import DelayCompensated
+from agents.delay import DelayCompensated, NearFuture
 from lpv_track_env.conditions import Actuation, Conditions
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.vector_env import PathTrackingVectorEnv
@@ -91,6 +93,47 @@ def test_what_is_shown_is_what_comes(trajectory: str, given: dict[str, float]) -
         sent = listener.actions[step - 1]
         assert float(shown.acceleration) == pytest.approx(sent[0], abs=1e-6)
         assert float(shown.steering_angle) == pytest.approx(sent[1], abs=1e-6)
+
+
+def test_it_slides_as_the_vehicle_does() -> None:
+    """On a slippery road the vehicle ends where it was shown, not where linear tyres lead."""
+    later, friction = 4, 0.2
+    env = PathTrackingEnv(
+        "circle", vehicle="bmw-320i", speed_mode="fixed", fixed_speed=12.0,
+        conditions=Conditions(
+            estimator="truth", friction=friction, steering_dead_time=0.2, drive_dead_time=0.2
+        ),
+    )  # fmt: skip
+    task = DrivingTask.of(env)
+    linear = NearFuture(dataclasses.replace(task, friction=math.inf), env.actuation)
+    listener = Listener(task, np.zeros((0, 2)))
+    agent = DelayCompensated(listener, task, env.actuation)
+    observation, _ = env.reset(seed=0)
+    first, k = np.array(env.actuators), np.arange(30)
+    listener.actions = first + np.column_stack(
+        [np.maximum(-0.1 * k, -1.0), np.minimum(0.004 * k, 0.08)]
+    )
+    states, gripping = [env.state], []
+    memory, start = None, np.array([True])
+    for step in range(30):
+        if step:
+            rows = observation[None].astype(np.float64)
+            linear.predict(rows, np.array([False]), memory)
+            gripping.append(rows[0])
+        action, memory = agent.predict(observation, memory, start)
+        start = np.array([False])
+        observation, *_ = env.step(action)
+        states.append(env.state)
+    for step in range(1, 30 - later):
+        came = states[step + later]
+        shown = env.layout.unpack(listener.shown[step])
+        # The prediction's 54 steps of 0.2 s are not the vehicle's 56, so that a command comes into
+        # force up to half of one early or late: 0.1 m/s^2 or 0.004 rad for 2 ms.
+        assert float(shown.longitudinal_speed) == pytest.approx(came[0], abs=5e-4)
+        assert float(shown.lateral_speed) == pytest.approx(came[1], abs=5e-4)
+        assert float(shown.yaw_rate) == pytest.approx(came[3], abs=5e-4)
+    apart = env.layout.unpack(gripping[20]).yaw_rate - states[21 + later][3]
+    assert abs(float(apart)) > 0.05
 
 
 def test_without_delays_only_the_actuators_become_the_last_command() -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lpv_track_env import bicycle, lpv, tyres
 from lpv_track_env.bicycle import VX, VY, YAW_RATE, derivative, inverse_speed
-from lpv_track_env.integration import integrate, integrate_sliding
+from lpv_track_env.integration import integrate, integrate_sliding, integrate_with
 from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vehicle import BMW_320I, M2_MINIBUS, VEHICLES, VehicleParameters
 
@@ -226,6 +226,19 @@ def test_integration_converges(car: VehicleParameters, friction: float) -> None:
     assert errors[2] <= 0.35 * errors[0]
     slid = integrate(*state, -2.0, 0.15, *parameters, 0.005, 20)
     assert abs(slid[YAW_RATE]) > 0.0
+
+
+@PRESETS
+def test_integration_follows_the_friction_bit_for_bit(car: VehicleParameters) -> None:
+    states, inputs = drawn(200, seed=3)
+    parameters = car.as_array().tolist()
+    for x, u in zip(states.T.tolist(), inputs.T.tolist(), strict=True):
+        tyre = tyres.of(car, math.inf)
+        found = integrate_with(*x, *u, *parameters, tyre, 0.005, 4, 0.0)
+        assert found == integrate(*x, *u, *parameters, 0.005, 4, 0.0)
+        tyre = tyres.of(car, 0.6)
+        found = integrate_with(*x, *u, *parameters, tyre, 0.005, 4, 0.0)
+        assert found == integrate_sliding(*x, *u, *parameters, tyre, 0.005, 4, 0.0)
 
 
 def test_wild_states_and_any_friction_stay_finite() -> None:

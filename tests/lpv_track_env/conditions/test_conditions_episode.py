@@ -11,11 +11,13 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 import trajectories
+from lpv_track_env import tyres
 from lpv_track_env.bicycle import VX, VY, YAW_RATE, X, Y, derivative
 from lpv_track_env.conditions import IDEAL, REALTIME, WIND_LEVER, Conditions
 from lpv_track_env.conditions import layout as conditions_layout
 from lpv_track_env.conditions.vehicle import AIR_DENSITY
 from lpv_track_env.env import PathTrackingEnv
+from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vehicle import VEHICLES
 
@@ -63,6 +65,23 @@ def test_ideal_conditions_are_the_simulation() -> None:
             np.testing.assert_allclose(theirs[4]["estimate"], ours[4]["state"], atol=1e-6)
             if ours[2]:
                 break
+
+
+def test_the_filter_slides_with_the_vehicle() -> None:
+    """With perfect readings it follows a car that skids, on the tyres of the nominal friction."""
+    env = PathTrackingEnv("T3", conditions=Conditions(friction=0.3), max_lateral_error=100.0)
+    env.reset(seed=0, options={"speed": 9.0})
+    used = []
+    for action in random_actions(60) + np.array([0.0, 0.1]):
+        info = act(env, *action)
+        np.testing.assert_allclose(info["estimate"], info["state"], atol=2e-5)
+        used.append(abs(info["state"][VX] * info["state"][YAW_RATE]) / (0.3 * GRAVITY))
+    assert max(used) > 0.8
+    drift = PathTrackingEnv("T3", "bmw-320i", plant="drift", conditions="realtime")
+    for changed in (env, PathTrackingEnv("T3", conditions=REALTIME), drift):
+        tyre = conditions_layout.SETTINGS + filtering.TYRE
+        found = changed._conditioned.spec[tyre : tyre + 6]
+        np.testing.assert_array_equal(found, tyres.of(changed.vehicle, changed.friction))
 
 
 def test_steering_lags_behind_a_ramp_by_its_time_constant() -> None:

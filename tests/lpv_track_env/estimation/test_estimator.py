@@ -20,16 +20,20 @@ Array = NDArray[np.float64]
 CAR = VEHICLES["m2-minibus"]
 SETTINGS = EstimatorSettings()
 RUNS, PERIODS, PERIOD = 25, 300, 0.05
+TYRES = pytest.mark.parametrize("friction", [math.inf, 0.3])
+"""The linear tyre, and one whose axles slide up to 0.9 of their patches in these drives."""
 
 
-def simulated(state: Array, action: Array, duration: float, steps: int = 20) -> Array:
+def simulated(
+    state: Array, action: Array, duration: float, friction: float = math.inf, steps: int = 20
+) -> Array:
     """The bicycle driven on by Runge-Kutta steps on NumPy: not the filter's compiled integrator."""
     h = duration / steps
     for _ in range(steps):
-        k1 = bicycle.derivative(state, action, CAR)
-        k2 = bicycle.derivative(state + 0.5 * h * k1, action, CAR)
-        k3 = bicycle.derivative(state + 0.5 * h * k2, action, CAR)
-        k4 = bicycle.derivative(state + h * k3, action, CAR)
+        k1 = bicycle.derivative(state, action, CAR, friction)
+        k2 = bicycle.derivative(state + 0.5 * h * k1, action, CAR, friction)
+        k3 = bicycle.derivative(state + 0.5 * h * k2, action, CAR, friction)
+        k4 = bicycle.derivative(state + h * k3, action, CAR, friction)
         state = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     return state
 
@@ -38,8 +42,13 @@ class Drive:
     """A vehicle with the noise that the filter believes in, and a filter beside it."""
 
     def __init__(
-        self, seed: int, latency: float = 0.1, settings: EstimatorSettings = SETTINGS
+        self,
+        seed: int,
+        latency: float = 0.1,
+        settings: EstimatorSettings = SETTINGS,
+        friction: float = math.inf,
     ) -> None:
+        self.friction = friction
         self.rng = np.random.default_rng(seed)
         s, draw = settings, self.rng.normal
         self.latency, self.time = latency, 0.0
@@ -47,7 +56,7 @@ class Drive:
             s.initial_gyro_bias, s.initial_heading_bias, s.initial_steering_offset,
         ]  # fmt: skip
         self.state = np.array([8.0, draw() * s.lateral_speed_noise, 0.0, 0.0, 0.0, 0.0])
-        self.filter = Estimator(CAR, s, period=PERIOD)
+        self.filter = Estimator(CAR, s, period=PERIOD, friction=friction)
         self.filter.begin(
             0.0,
             draw() * s.position_deviation,
@@ -63,7 +72,9 @@ class Drive:
         action = np.array(
             [0.2 + 0.5 * math.sin(0.2 * self.time), 0.02 + 0.1 * math.sin(0.3 * self.time)]
         )
-        self.state = simulated(self.state, action + np.array([0.0, self.biases[2]]), PERIOD)
+        self.state = simulated(
+            self.state, action + np.array([0.0, self.biases[2]]), PERIOD, self.friction
+        )
         noise = [
             s.speed_noise, s.lateral_speed_noise, s.heading_noise, s.yaw_rate_noise,
             s.position_noise, s.position_noise,
@@ -111,20 +122,22 @@ def test_consistent_over_many_runs(latency: float) -> None:
         assert low <= np.sum(values) <= high, (degrees, np.mean(values))
 
 
-def test_perfect_readings_are_followed_exactly() -> None:
+@TYRES
+def test_perfect_readings_are_followed_exactly(friction: float) -> None:
     state = np.array([8.0, 0.0, 0.3, 0.0, 5.0, -2.0])
-    estimator = Estimator(CAR, SETTINGS, period=PERIOD)
+    estimator = Estimator(CAR, SETTINGS, period=PERIOD, friction=friction)
     estimator.begin(0.0, 5.0, -2.0, 0.3, 8.0)
     for k in range(1, 200):
         action = np.array([0.3 * math.sin(0.1 * k), 0.1 * math.sin(0.05 * k)])
-        state = simulated(state, action, PERIOD)
+        state = simulated(state, action, PERIOD, friction)
         estimator.advance(k * PERIOD, *action, heading=state[2], yaw_rate=state[3], speed=state[0])
         assert estimator.take_fix(k * PERIOD, state[4], state[5]) == "used"
     np.testing.assert_allclose(estimator.state, state, atol=2e-6)
     np.testing.assert_allclose(estimator.biases, 0.0, atol=1e-6)
 
 
-def test_prediction_covariance_is_that_of_the_model() -> None:
+@TYRES
+def test_prediction_covariance_is_that_of_the_model(friction: float) -> None:
     """One prediction against Jacobians of CasADi's on the same field, integrated by itself."""
     import casadi as ca
 
@@ -132,13 +145,13 @@ def test_prediction_covariance_is_that_of_the_model() -> None:
     steps, h = 10, PERIOD / 10
     after = x
     for _ in range(steps):
-        k1 = bicycle.casadi_derivative(after, u, CAR)
-        k2 = bicycle.casadi_derivative(after + 0.5 * h * k1, u, CAR)
-        k3 = bicycle.casadi_derivative(after + 0.5 * h * k2, u, CAR)
-        k4 = bicycle.casadi_derivative(after + h * k3, u, CAR)
+        k1 = bicycle.casadi_derivative(after, u, CAR, friction)
+        k2 = bicycle.casadi_derivative(after + 0.5 * h * k1, u, CAR, friction)
+        k3 = bicycle.casadi_derivative(after + 0.5 * h * k2, u, CAR, friction)
+        k4 = bicycle.casadi_derivative(after + h * k3, u, CAR, friction)
         after = after + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     jacobians = ca.Function("j", [x, u], [ca.jacobian(after, x), ca.jacobian(after, u)])
-    drive = Drive(3)
+    drive = Drive(3, friction=friction)
     for _ in range(100):
         drive.go_on()
     before, covariance = drive.filter.state, drive.filter.covariance
