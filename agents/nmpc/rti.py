@@ -3,7 +3,8 @@
 `solve` solves the problem of one vehicle; `control` computes actions for rows of observations.
 Diehl, Bock and Schloeder, "A real-time iteration scheme for nonlinear optimization in optimal
 feedback control", SIAM J. Control Optim. 43, 2005. The plan is rolled out from the measured state,
-so it satisfies the dynamics before every QP.
+so it satisfies the dynamics before every QP. Where the tyres' friction is limited the QP's step may
+lead beyond the grip that its linear model promises, so a line search on the exact cost shortens it.
 """
 
 import math
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.nmpc import layout as L
-from agents.nmpc.linearisation import differentiate
+from agents.nmpc.linearisation import acceleration, advance, differentiate, taken
 from agents.nmpc.qp import (
     CODE,
     COST,
@@ -25,6 +26,7 @@ from agents.nmpc.qp import (
     STATS,
     SUCCESS,
     clamp,
+    copy_point,
     solve_qp,
 )
 from agents.reference import NODE, fill_leading_nodes
@@ -38,6 +40,11 @@ from trajectories.compilation import (
 
 Array = NDArray[Any]
 Float = Any
+
+SHORTENINGS = 3
+"""Halvings of a step that the line search tries at most."""
+DECREASE = 1e-4
+"""Share of the decrease that the QP expects which a step must reach (Armijo's rule)."""
 
 # Flags of a vehicle, (FLAGS,).
 (
@@ -108,6 +115,66 @@ def cost_of(
     return 0.5 * total
 
 
+@compiled_internal
+def roll_out(stages: Array, constants: Array) -> None:
+    """Roll the inputs in the stages' STEP out from the plan's first state."""
+    n = stages.shape[0] - 1
+    lengths, grids = L.grid(constants, L.LENGTH, n), L.grid(constants, L.SUBSTEPS, n)
+    for k in range(2, L.POINT):
+        stages[0, L.STEP_A + k] = stages[0, L.PLAN_A + k]
+    for i in range(n):
+        e, end = stages[i], stages[i + 1]
+        following = advance(
+            taken(e, L.STEP_VX), e[L.STEP_A], e[L.STEP_DELTA], lengths[i], grids[i], constants
+        )
+        for k in range(6):
+            end[L.STEP_VX + k] = following[k]
+
+
+@compiled_internal
+def exact_cost(
+    stages: Array, lanes: Array, at: int, last_a: Float, last_delta: Float, weights: Array,
+    constants: Array,
+) -> Float:  # fmt: skip
+    """Fill the slacks of a point that satisfies the dynamics, and return its cost."""
+    p, vx, vy = constants, at + L.NOW_VX - L.NOW_A, at + L.NOW_VY - L.NOW_A
+    for i in range(lanes.shape[1]):
+        rate = acceleration(taken(stages[i], vx), stages[i, at], stages[i, at + 1], p)
+        ahead, aside = stages[i + 1, vx], stages[i + 1, vy]
+        lanes[L.SLACKS[0], i] = max(p[L.LOW_SPEED] - ahead, ahead - p[L.HIGH_SPEED], 0.0)
+        lanes[L.SLACKS[1], i] = max(p[L.LOW_RATE] - rate, rate - p[L.HIGH_RATE], 0.0)
+        lanes[L.SLACKS[2], i] = max(abs(aside) - p[L.RATIO] * ahead, 0.0)
+    return cost_of(stages, lanes, at, last_a, last_delta, weights, constants)
+
+
+@compiled_internal
+def search_line(
+    stages: Array, lanes: Array, last_a: Float, last_delta: Float, weights: Array,
+    constants: Array, expected: Float,
+) -> Float:  # fmt: skip
+    """Shorten the QP's step until the exact cost decreases, and return that cost.
+
+    The step leads from the stages' PLAN to their NOW, whose cost the QP expects to be `expected`.
+    NOW becomes the roll-out of the shortened step, or the plan if no step decreases the cost.
+    """
+    start = exact_cost(stages, lanes, L.PLAN_A, last_a, last_delta, weights, constants)
+    rounding, length = 1e-12 * abs(start), 1.0
+    for _ in range(SHORTENINGS + 1):
+        for i in range(lanes.shape[1]):
+            e = stages[i]
+            for k in range(2):
+                change = e[L.NOW_A + k] - e[L.PLAN_A + k]
+                e[L.STEP_A + k] = e[L.PLAN_A + k] + length * change
+        roll_out(stages, constants)
+        found = exact_cost(stages, lanes, L.STEP_A, last_a, last_delta, weights, constants)
+        if found <= start - DECREASE * length * (start - expected) + rounding:
+            copy_point(stages, L.NOW_A, L.STEP_A)
+            return found
+        length *= 0.5
+    copy_point(stages, L.NOW_A, L.PLAN_A)
+    return exact_cost(stages, lanes, L.NOW_A, last_a, last_delta, weights, constants)
+
+
 @compiled_in_place
 def solve(
     stages: Array, lanes: Array, last_a: Float, last_delta: Float, weights: Array,
@@ -128,7 +195,10 @@ def solve(
     code = solve_qp(stages, lanes, last_a, last_delta, weights, constants, stats)
     stats[COST] = math.nan
     if code == SUCCESS:
-        stats[COST] = cost_of(stages, lanes, L.NOW_A, last_a, last_delta, weights, constants)
+        cost = cost_of(stages, lanes, L.NOW_A, last_a, last_delta, weights, constants)
+        if constants[L.TYRE + 1] < math.inf:
+            cost = search_line(stages, lanes, last_a, last_delta, weights, constants, cost)
+        stats[COST] = cost
     for soft in range(3):
         largest = 0.0
         if code == SUCCESS:

@@ -43,23 +43,8 @@ def roll_out_cost(
     stages: Array, lanes: Array, last_a: Float, last_delta: Float, weights: Array, constants: Array
 ) -> Float:
     """Roll the inputs in the stages' STEP out, fill the slacks, and return the exact cost."""
-    p, n = constants, lanes.shape[1]
-    lengths, grids = L.grid(p, L.LENGTH, n), L.grid(p, L.SUBSTEPS, n)
-    for k in range(2, L.POINT):
-        stages[0, L.STEP_A + k] = stages[0, L.PLAN_A + k]
-    for i in range(n):
-        e, end = stages[i], stages[i + 1]
-        a, delta = e[L.STEP_A], e[L.STEP_DELTA]
-        here = linearisation.taken(e, L.STEP_VX)
-        following = linearisation.advance(here, a, delta, lengths[i], grids[i], p)
-        for k in range(6):
-            end[L.STEP_VX + k] = following[k]
-        rate = linearisation.acceleration(here, a, delta, p)
-        vx, vy = end[L.STEP_VX], end[L.STEP_VY]
-        lanes[L.SLACKS[0], i] = max(p[L.LOW_SPEED] - vx, vx - p[L.HIGH_SPEED], 0.0)
-        lanes[L.SLACKS[1], i] = max(p[L.LOW_RATE] - rate, rate - p[L.HIGH_RATE], 0.0)
-        lanes[L.SLACKS[2], i] = max(abs(vy) - p[L.RATIO] * vx, 0.0)
-    return rti.cost_of(stages, lanes, L.STEP_A, last_a, last_delta, weights, constants)
+    rti.roll_out(stages, constants)
+    return rti.exact_cost(stages, lanes, L.STEP_A, last_a, last_delta, weights, constants)
 
 
 @compiled

@@ -142,6 +142,32 @@ def test_one_iteration_is_one_program_along_the_shifted_plan(n: int) -> None:
         np.testing.assert_allclose(solved(warm)[0], wanted, atol=1e-6)
 
 
+@pytest.mark.parametrize("car", [M2_MINIBUS, BMW_320I], ids=lambda car: car.name)
+def test_with_limited_friction_no_step_raises_the_exact_cost(
+    car: VehicleParameters,
+) -> None:
+    """The QP's own step would; the plan's cost and states are those of CasADi's roll-out."""
+    problem = NmpcProblem(car, horizon=15, friction=0.3)
+    solver, raised = RtiSolver(problem), 0
+    for case in cases(60, problem, decades=0.0, errors=3.0):
+        state, last, reference, weights = case.parameters
+        start = np.tile(last, (problem.horizon, 1))
+        solution, _ = solver.solve(*case.parameters)
+        if solution.status is Status.MAXITER:
+            continue
+        inputs, states, slack = solved(solution)
+        price = plan_cost(problem, *case.parameters, inputs)
+        before = plan_cost(problem, *case.parameters, start).cost
+        assert price.excess <= 1e-9
+        assert price.cost <= before * (1.0 + 1e-9)
+        assert solution.cost == pytest.approx(price.cost, rel=1e-9)
+        np.testing.assert_allclose(slack.max(axis=0), price.slack.max(axis=0), atol=1e-9)
+        assert scaled_error(states, rolled_out(problem, state, inputs)) <= 1e-9
+        whole = solver.solve_qp(state, last, reference, weights, start)[1]
+        raised += plan_cost(problem, *case.parameters, whole).cost > before
+    assert raised > 3
+
+
 @each_vehicle
 def test_plans_keep_the_hard_limits_and_are_priced_as_predicted(car: VehicleParameters) -> None:
     problem = NmpcProblem(
