@@ -83,8 +83,8 @@ class DrivingTask:
     path: ReferencePath
     actuation: Actuation = NO_DELAYS
     """Nominal delays and lags between a command and its effect, s."""
-    friction: float = math.inf
-    """Nominal friction of tyres and road: the middle of its range, inf without a limit."""
+    friction_range: tuple[float, float] = (math.inf, math.inf)
+    """Least and largest friction of tyres and road, inf without a limit."""
 
     def __post_init__(self) -> None:
         kinds = {
@@ -94,7 +94,13 @@ class DrivingTask:
         for name, kind in kinds.items():
             instance_of(name, getattr(self, name), kind, f"of type {kind.__name__}")
         object.__setattr__(self, "control_period", checked_period(self.control_period))
-        object.__setattr__(self, "friction", FRICTION.of("friction", self.friction))
+        ends = tuple(FRICTION.of("friction", end) for end in self.friction_range)
+        object.__setattr__(self, "friction_range", ends)
+
+    @property
+    def friction(self) -> float:
+        """Nominal friction of tyres and road: the middle of its range, inf without a limit."""
+        return 0.5 * sum(self.friction_range)
 
     @property
     def delayed(self) -> bool:
@@ -117,7 +123,7 @@ class DrivingTask:
         TypeError
             If it is not a path tracking environment.
         """
-        names = ("layout", "vehicle", "control_period", "path", "actuation", "friction")
+        names = ("layout", "vehicle", "control_period", "path", "actuation", "friction_range")
         try:
             return cls(*(env.get_wrapper_attr(name) for name in names))
         except AttributeError as error:

@@ -31,6 +31,8 @@ APPROACH_SLOPE = 0.4
 """Largest tangent of the angle to the path at which a vehicle far from it approaches."""
 APPROACH_TIME, SHORTEST_APPROACH = 0.5, 2.0
 """Least length over which the offset of an approach decays: time at the vehicle's speed, s; m."""
+GRIP_SHARE, BRAKING_SHARE = 0.92, 0.6
+"""Share of mu g that a reference takes at most, and share of that by which it slows down."""
 
 
 class LocalReference(NamedTuple):
@@ -78,6 +80,8 @@ def local_reference(
     lengths: Array | None = None,
     *,
     leading: float | None = None,
+    grip: float = math.inf,
+    braking: float = math.inf,
 ) -> LocalReference:
     """Reconstruct nodes of the reference from the preview of an observation.
 
@@ -96,6 +100,9 @@ def local_reference(
     leading
         Largest acceleration, m/s^2, of the vehicle; with it the nodes lead a vehicle far from its
         reference, as `fill_leading_nodes` does.
+    grip, braking
+        Largest total acceleration and deceleration, m/s^2, with `leading`: the nodes are no faster
+        than they allow, see `cap_speeds`.
     """
     curvature = np.asarray(observation.preview_curvature, dtype=np.float64)
     rows = curvature.reshape(-1, curvature.shape[-1])
@@ -113,7 +120,10 @@ def local_reference(
                 observation.lateral_error,
             )
         )  # fmt: skip
-        _lead_rows(rows, first, speed, period, lengths, vx, heading, error, leading, nodes)
+        _lead_rows(
+            rows, first, speed, period, lengths, vx, heading, error, leading, grip, braking,
+            np.empty(rows.shape[1] + 1), nodes,
+        )  # fmt: skip
     shaped = nodes.reshape(*curvature.shape[:-1], len(lengths) + 1, NODE)
     return LocalReference(
         arc_length=shaped[..., NODE_ARC_LENGTH],
@@ -157,23 +167,97 @@ def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, no
 
 
 @compiled_internal
+def exceeds(
+    curvature: Array, first_speed: Any, speed: Array, period: Any, steps: int, grip: Any
+) -> bool:
+    """Return whether the acceleration of a preview exceeds `grip` (m/s^2) in its first `steps`."""
+    before, largest = first_speed, 0.0
+    for k in range(steps):
+        after = float(speed[k])
+        fastest = max(before, after)
+        turning, gain = fastest * fastest * float(curvature[k]), (after - before) / period
+        largest = max(largest, turning * turning + gain * gain)
+        before = after
+    return bool(largest > grip * grip)
+
+
+@compiled_internal
+def left_by(turning: Any, grip: Any) -> Any:
+    """Return what a lateral acceleration leaves of the friction circle, m/s^2."""
+    return math.sqrt(max(grip * grip - turning * turning, 0.0))
+
+
+@compiled_internal
+def cap_speeds(
+    curvature: Array, first_speed: Any, speed: Array, period: Any, pace: Any, rate: Any, grip: Any,
+    braking: Any, capped: Array,
+) -> bool:  # fmt: skip
+    """Fill the speeds (n + 1,) at which friction lets a vehicle pass the preview's first nodes.
+
+    Returns False, with nothing filled, if the preview is slow enough.
+
+    No node is passed faster than in the preview, and on no interval is the total acceleration
+    larger than `grip` (m/s^2): bends are taken more slowly, and what they leave of the friction
+    circle brakes before and accelerates behind them. It does so as the preview does, or, where that
+    is more, with `SHARE` of `rate`, and of `braking`, but `BRAKING_SHARE` of the grip (m/s^2). Only
+    a vehicle that is too fast already, at `pace` (m/s), is braked by no more than the latter.
+    """
+    steps, squared, bend, after = capped.shape[0] - 1, math.inf, 0.0, 0.0
+    if not exceeds(curvature, first_speed, speed, period, steps, grip):
+        return False
+    slowed = min(SHARE * braking, BRAKING_SHARE * grip) * period
+    # Backwards with squares of speeds, from node to node, each with the interval behind it.
+    for k in range(steps, -1, -1):
+        before, curve = first_speed, 0.0
+        if k > 0:
+            before, curve = float(speed[k - 1]), abs(float(curvature[k - 1]))
+        if k < steps:
+            lost = min(max(before - after, slowed), period * left_by(squared * bend, grip))
+            squared += lost * (before + after)
+        squared = min(squared, before * before)
+        if squared * max(bend, curve) > grip:
+            squared = grip / max(bend, curve)
+        capped[k], after, bend = squared, before, curve
+    before, least = first_speed, max(pace, 0.0) ** 2
+    for k in range(steps + 1):
+        capped[k] = min(max(capped[k], least), before * before)
+        if k < steps:
+            after = float(speed[k])
+            left = period * left_by(capped[k] * abs(float(curvature[k])), grip)
+            gained = min(max(after - before, SHARE * rate * period), left)
+            capped[k + 1] = min(capped[k + 1], capped[k] + gained * (before + after))
+            least -= slowed * (before + after)
+            before = after
+        capped[k] = math.sqrt(capped[k])
+    return True
+
+
+@compiled_internal
 def fill_nodes_at(
     curvature: Array, first_speed: Any, speed: Array, period: Any, lengths: Array, pace: Any,
-    rate: Any, nodes: Array,
+    rate: Any, grip: Any, braking: Any, capped: Array, nodes: Array,
 ) -> None:  # fmt: skip
     """Fill nodes (n + 1, NODE) that are `lengths` (n,) s apart, from the intervals of one preview.
 
     Within an interval of `period` s acceleration and curvature are constant, as in `fill_nodes`.
     Beyond the last interval the reference goes on along it, at its end speed.
 
-    The nodes are no faster than pace + LEAD + SHARE `rate` t (m/s, m/s^2): where the reference is,
-    they pass its places more slowly.
+    The nodes are no faster than pace + LEAD + SHARE `rate` t (m/s, m/s^2), and none of the first
+    intervals, as many as `capped` has entries for beside the first, is passed faster than
+    `cap_speeds` says: where the reference is, they pass its places more slowly.
     """
+    limited = grip < math.inf and cap_speeds(
+        curvature, first_speed, speed, period, pace, rate, grip, braking, capped
+    )
     s = x = y = heading = 0.0
     c, d = 1.0, 0.0
-    v, at, left, last = first_speed, 0, period, curvature.shape[0] - 1
+    v, at, last = first_speed, 0, curvature.shape[0] - 1
+    end, left = float(speed[0]), period
+    if limited:
+        v = capped[0]
+        end, left = capped_interval(first_speed, speed, period, capped, 0)
     fastest = max(pace, 0.0) + LEAD
-    nodes[0, NODE_SPEED], nodes[0, NODE_HEADING] = min(first_speed, fastest), 0.0
+    nodes[0, NODE_SPEED], nodes[0, NODE_HEADING] = min(v, fastest), 0.0
     nodes[0, NODE_X], nodes[0, NODE_Y], nodes[0, NODE_ARC_LENGTH] = 0.0, 0.0, 0.0
     for k in range(nodes.shape[0] - 1):
         rest, gain = lengths[k], SHARE * rate * lengths[k]
@@ -183,9 +267,9 @@ def fill_nodes_at(
         fastest += gain
         while rest > 1e-9:
             interval = min(at, last)
-            step, after = left, float(speed[interval])
+            step, after = left, end
             if rest < left - 1e-9:
-                step, after = rest, v + (after - v) * (rest / left)
+                step, after = rest, v + (end - v) * (rest / left)
             if at > last:
                 step, after = rest, v
             length = 0.5 * (v + after) * step
@@ -195,14 +279,37 @@ def fill_nodes_at(
             v, rest, left = after, rest - step, left - step
             if left <= 1e-9:
                 at, left = at + 1, period
+                if at <= last:
+                    end = float(speed[at])
+                    if limited:
+                        end, left = capped_interval(first_speed, speed, period, capped, at)
         nodes[k + 1, NODE_SPEED], nodes[k + 1, NODE_HEADING] = min(v, fastest), heading
         nodes[k + 1, NODE_X], nodes[k + 1, NODE_Y], nodes[k + 1, NODE_ARC_LENGTH] = x, y, s
 
 
 @compiled_internal
+def capped_interval(
+    first_speed: Any, speed: Array, period: Any, capped: Array, k: int
+) -> tuple[Any, Any]:
+    """Return the end speed (m/s) of interval k, and the time (s) that it takes, with `cap_speeds`.
+
+    Intervals without capped speeds keep the preview's.
+    """
+    end = float(speed[k])
+    if k + 1 >= capped.shape[0]:
+        return end, period
+    before = float(speed[k - 1]) if k > 0 else first_speed
+    slow = capped[k] + capped[k + 1]
+    if slow == before + end:
+        return end, period
+    return capped[k + 1], (before + end) * period / slow
+
+
+@compiled_internal
 def fill_leading_nodes(
     curvature: Array, first_speed: Any, speed: Array, period: Any, lengths: Array, vx: Any,
-    heading_error: Any, lateral_error: Any, rate: Any, nodes: Array,
+    heading_error: Any, lateral_error: Any, rate: Any, grip: Any, braking: Any, capped: Array,
+    nodes: Array,
 ) -> None:  # fmt: skip
     """Fill nodes as `fill_nodes_at` does, such that they lead a vehicle far from its reference.
 
@@ -211,7 +318,9 @@ def fill_leading_nodes(
     reference it would cut the bend between. One far beside the path is led back by `approach`.
     """
     pace = vx * math.cos(heading_error)
-    fill_nodes_at(curvature, first_speed, speed, period, lengths, pace, rate, nodes)
+    fill_nodes_at(
+        curvature, first_speed, speed, period, lengths, pace, rate, grip, braking, capped, nodes
+    )
     approach(nodes, lateral_error, vx)
 
 
@@ -244,19 +353,21 @@ def _fill_rows(
 ) -> None:
     for row in range(nodes.shape[0]):
         fill_nodes_at(
-            curvature[row], first_speed[row], speed[row], period, lengths, math.inf, 0.0, nodes[row]
-        )
+            curvature[row], first_speed[row], speed[row], period, lengths, math.inf, 0.0, math.inf,
+            math.inf, speed[row], nodes[row],
+        )  # fmt: skip
 
 
 @compiled
 def _lead_rows(
     curvature: Array, first_speed: Array, speed: Array, period: Any, lengths: Array, vx: Array,
-    heading_error: Array, lateral_error: Array, rate: Any, nodes: Array,
+    heading_error: Array, lateral_error: Array, rate: Any, grip: Any, braking: Any, capped: Array,
+    nodes: Array,
 ) -> None:  # fmt: skip
     for row in range(nodes.shape[0]):
         fill_leading_nodes(
             curvature[row], first_speed[row], speed[row], period, lengths, vx[row],
-            heading_error[row], lateral_error[row], rate, nodes[row],
+            heading_error[row], lateral_error[row], rate, grip, braking, capped, nodes[row],
         )  # fmt: skip
 
 

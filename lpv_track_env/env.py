@@ -205,7 +205,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._renderer: Renderer | None = None
         self._open_views()
         self._use(self.base_task, self._plant_of(self.base_task))
-        if self._plant is not None and self._nominal_friction < self.friction == math.inf:
+        slippery = self.conditions is not None and self.conditions.middle("friction") < math.inf
+        if slippery and self.friction == math.inf:
             message = f"conditions: friction has no effect on plant {shown(plant)}: linear tyres"
             warnings.warn(message, UserWarning, stacklevel=3)
 
@@ -280,15 +281,15 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return Actuation() if self.conditions is None else self.conditions.actuation
 
     @property
-    def _nominal_friction(self) -> float:
-        return math.inf if self.conditions is None else self.conditions.middle("friction")
+    def friction_range(self) -> tuple[float, float]:
+        """Least and largest friction of tyres and road, inf without a limit."""
+        given = (math.inf,) * 2 if self.conditions is None else self.conditions.ends("friction")
+        return given if self._plant is None else self._plant.friction_range(*given)
 
     @property
     def friction(self) -> float:
         """Nominal friction of tyres and road: the middle of its range, inf without a limit."""
-        if self._plant is None:
-            return self._nominal_friction
-        return self._plant.nominal_friction(self._nominal_friction)
+        return 0.5 * sum(self.friction_range)
 
     @property
     def actuators(self) -> tuple[float, float]:

@@ -16,9 +16,10 @@ from agents.base import DrivingTask, TrackingAgent, blind_control
 from agents.classical.geometric import Stanley
 from agents.nmpc.problem import HORIZON, PERIOD, NmpcProblem
 from agents.nmpc.schedule import Switching
-from agents.reference import local_reference
+from agents.reference import GRIP_SHARE, local_reference
 from agents.weights import TrackingWeights, WeightSchedule, weights_from
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
+from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.tyres import FRICTION
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.arguments import Whole, check_fields, instance_of, numbers, shown
@@ -59,8 +60,9 @@ class NmpcSettings:
     linear_penalty, quadratic_penalty
         Penalties of slack on (vx, vy, vx'), see `NmpcProblem`.
     friction
-        Coefficient of friction of the model's tyres: a number, "known", the nominal one of the
-        environment, or "linear", the tyre without a limit.
+        Coefficient of friction of the model's tyres and, `GRIP_SHARE` of it, of the reference's
+        acceleration: a number; "known", the nominal one of the environment for the tyres and the
+        least of its range for the reference; or "linear", neither has a limit.
     max_failures
         Failed solves in a row after which the vehicle is brought to a stop.
 
@@ -100,10 +102,12 @@ class NmpcSettings:
         weights = TrackingWeights() if self.weights is None else weights_from(self.weights)
         object.__setattr__(self, "weights", weights)
 
-    def friction_in(self, task: DrivingTask) -> float:
-        """Return the model's coefficient of friction for a task; inf is the linear tyre."""
-        words = {"known": task.friction, "linear": math.inf}
-        return words[self.friction] if isinstance(self.friction, str) else self.friction
+    def friction_in(self, task: DrivingTask) -> tuple[float, float]:
+        """Return the coefficients of friction of the tyres and the reference; inf is no limit."""
+        if not isinstance(self.friction, str):
+            return self.friction, self.friction
+        known = task.friction, task.friction_range[0]
+        return known if self.friction == "known" else (math.inf, math.inf)
 
 
 @dataclass
@@ -185,6 +189,7 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
     def __init__(self, task: DrivingTask, settings: NmpcSettings) -> None:
         super().__init__(task)
         stages = stages_of(settings, task.layout, task.control_period)
+        friction, least = settings.friction_in(task)
         self.problem = NmpcProblem(
             vehicle=settings.model or task.vehicle,
             horizon=len(stages),
@@ -192,8 +197,10 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
             first_period=task.control_period,
             linear_penalty=settings.linear_penalty,
             quadratic_penalty=settings.quadratic_penalty,
-            friction=settings.friction_in(task),
+            friction=friction,
         )
+        self.grip = GRIP_SHARE * least * GRAVITY
+        """Largest total acceleration of the reference, m/s^2."""
         self.preview_steps = self.problem.preview_steps(task.layout.preview_period)
         self.max_failures = settings.max_failures
         self._stanley = Stanley(task)
@@ -257,9 +264,10 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
              o.lateral_error]
         )  # fmt: skip
         last = np.array([o.acceleration, o.steering_angle]).clip(low, high)
+        slowest, fastest = self.problem.vehicle.longitudinal_acceleration_range
         nodes = local_reference(
             o, self.task.layout.preview_period, self.problem.periods,
-            leading=self.problem.vehicle.longitudinal_acceleration_range[1],
+            leading=min(fastest, self.grip), grip=self.grip, braking=-slowest,
         )  # fmt: skip
         return state, last, np.stack([nodes.speed, nodes.heading, nodes.x, nodes.y], axis=-1)
 

@@ -209,10 +209,10 @@ def solve(
 
 
 @compiled_internal
-def load_observation(observation: Array, constants: Array, stages: Array) -> bool:
+def load_observation(observation: Array, constants: Array, stages: Array, lanes: Array) -> bool:
     """Write first state and reference to the stages, in the frame of the path's foot point.
 
-    Returns False, and writes nothing, if the observation is not finite.
+    Returns False, and writes nothing, if the observation is not finite. `lanes` is working space.
     """
     total = 0.0
     for k in range(observation.shape[0]):
@@ -225,11 +225,15 @@ def load_observation(observation: Array, constants: Array, stages: Array) -> boo
     e[L.PLAN_X], e[L.PLAN_Y] = 0.0, o[entry.LATERAL_ERROR]
     first = entry.PREVIEW_START
     speeds = first + (o.shape[0] - first) // 2
+    # Of a preview that is very long for the horizon, only as many intervals as there is room for.
+    capped = lanes.reshape(lanes.size)[: min(speeds - first + 1, lanes.size)]
+    grip = constants[L.GRIP]
     fill_leading_nodes(
         o[first:speeds], o[entry.REFERENCE_SPEED], o[speeds:], constants[L.PREVIEW_PERIOD],
         L.grid(constants, L.LENGTH, stages.shape[0] - 1),
         o[entry.LONGITUDINAL_SPEED], o[entry.HEADING_ERROR], o[entry.LATERAL_ERROR],
-        constants[L.HIGH_RATE], stages[:, L.REFERENCE : L.REFERENCE + NODE],
+        min(constants[L.HIGH_RATE], grip), grip, -constants[L.LOW_RATE], capped,
+        stages[:, L.REFERENCE : L.REFERENCE + NODE],
     )  # fmt: skip
     return True
 
@@ -263,7 +267,7 @@ def control(
         for k in range(STATS):
             stats[row, k] = 0.0
         stats[row, COST] = math.nan
-        if load_observation(observations[j], constants, stages):
+        if load_observation(observations[j], constants, stages, lanes):
             last_a = observations[j, entry.ACCELERATION]
             last_a = min(max(last_a, constants[L.LOW_A]), constants[L.HIGH_A])
             last_delta = observations[j, entry.STEERING_ANGLE]

@@ -129,6 +129,7 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         )  # fmt: skip
         space = slice(layout.SPACE_LOW_A, layout.SPACE_HIGH_DELTA + 1)
         self.solver.constants[space] = [*self._low, *self._high]
+        self.solver.constants[layout.GRIP] = self.grip
         self._threads = checked_threads(threads)
         self._work = layout.working_space(self.problem.horizon, shares(self._threads))
         self._memory: RtiMemory | None = None

@@ -1,5 +1,6 @@
 """Fast solver of the NMPC's problem, compiled: real-time iteration, or SQP to convergence."""
 
+import math
 import time
 from collections.abc import Callable
 from itertools import pairwise
@@ -206,6 +207,7 @@ class RtiSolver:
                 *np.array(problem.quadratic_penalty)[order],
                 *self.damping,
                 *tyres.of(car, problem.friction),
+                math.inf,
                 *periods,
                 *problem.substeps,
                 *(periods / NOMINAL_PERIOD),

@@ -132,7 +132,7 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.highway, self.vehicle = inner, vehicle_of(inner)
         self.control_period = 1.0 / inner.config["policy_frequency"]
         self.layout = ObservationLayout(preview_steps)
-        self.actuation, self.friction = Actuation(), math.inf
+        self.actuation, self.friction_range = Actuation(), (math.inf, math.inf)
         self.route = None if route is None else tuple(route)
         self._throttle = bool(inner.action_type.longitudinal)
         self._cruise = cruise if self._throttle else None

@@ -134,11 +134,15 @@ class PlantEpisode:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
 
-    def nominal_friction(self, friction: float) -> float:
-        """Return the largest side force by load under the conditions' friction; inf if unknown."""
+    def friction_range(self, low: float, high: float) -> tuple[float, float]:
+        """Return the largest side forces by load for ends of the conditions' friction.
+
+        They are inf if unknown.
+        """
         if not isinstance(self.plant, RoadPlant):
-            return math.inf
-        return self.plant.friction * (friction if friction < math.inf else 1.0)
+            return math.inf, math.inf
+        own = self.plant.friction
+        return own * (low if low < math.inf else 1.0), own * (high if high < math.inf else 1.0)
 
     def begin(self, record: Array, friction: float = math.inf) -> None:
         """Start the plant at the state and steering angle of an episode's record.

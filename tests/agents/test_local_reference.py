@@ -99,7 +99,10 @@ def test_nodes_at_the_previews_own_times_are_its_nodes():
     for count in (1, 7, 20):
         first, curvature, speed = drawn(rng)
         mine, whole = np.zeros((count + 1, NODE)), np.zeros((count + 1, NODE))
-        fill_nodes_at(curvature, first, speed, PERIOD, np.full(count, PERIOD), math.inf, 0.0, mine)
+        fill_nodes_at(
+            curvature, first, speed, PERIOD, np.full(count, PERIOD), math.inf, 0.0, math.inf,
+            math.inf, np.zeros(21), mine,
+        )  # fmt: skip
         fill_nodes(curvature, first, speed, PERIOD, whole)
         np.testing.assert_allclose(mine, whole, rtol=1e-12, atol=1e-12)
 
@@ -224,6 +227,74 @@ def test_a_slow_vehicle_is_led_along_the_path_as_fast_as_it_can_drive(vx):
     np.testing.assert_allclose(led.speed, allowed, rtol=2e-3)
     gone = np.cumsum(0.5 * (led.speed[1:] + led.speed[:-1]) * lengths)
     np.testing.assert_allclose(led.arc_length[1:], gone, rtol=0.02)
+
+
+FINE = np.full(4000, 0.001)
+"""Lengths of nodes a millisecond apart, s."""
+
+
+@pytest.mark.parametrize("grip", [0.05, 2.0, 5.0])
+@pytest.mark.parametrize("radius", [10.0, -60.0])
+def test_on_a_circle_the_fastest_speed_is_that_at_the_grip(grip, radius):
+    """A vehicle that is as fast as friction allows stays so: v^2 / R = grip."""
+    allowed = math.sqrt(grip * abs(radius))
+    fast = observed(1.5 * allowed, 1.0 / radius, 1.5 * allowed)
+    found = local_reference(
+        fast._replace(longitudinal_speed=allowed), PERIOD, FINE[:1000], leading=2.0, grip=grip,
+        braking=4.0,
+    )  # fmt: skip
+    np.testing.assert_allclose(found.speed, allowed, rtol=1e-9)
+    np.testing.assert_allclose(found.arc_length[1:], allowed * np.cumsum(FINE[:1000]), rtol=1e-9)
+    np.testing.assert_allclose(found.heading, found.arc_length / radius, rtol=1e-9, atol=1e-12)
+    slow = observed(0.9 * allowed, 1.0 / radius, 0.9 * allowed)
+    for one, other in zip(
+        local_reference(slow, PERIOD, FINE, leading=2.0, grip=grip, braking=4.0),
+        local_reference(slow, PERIOD, FINE, leading=2.0), strict=True,
+    ):  # fmt: skip
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(("grip", "braked"), [(3.0, 0.6 * 3.0), (8.0, 0.8 * 4.0)])
+def test_before_a_bend_the_reference_brakes_over_the_distance_that_it_takes(grip, braked):
+    """(v0^2 - v1^2) / (2 b) before the bend, and no earlier."""
+    speed, radius, straight = 12.0, 12.0, 16
+    curvature = np.where(np.arange(20) < straight, 0.0, 1.0 / radius)
+    row = observed(speed, curvature, speed)._replace(longitudinal_speed=speed)
+    found = local_reference(row, PERIOD, FINE, leading=2.0, grip=grip, braking=4.0)
+    bend, slow = straight * PERIOD * speed, math.sqrt(grip * radius)
+    reached = np.sqrt(
+        np.clip(slow**2 + 2.0 * braked * (bend - found.arc_length), slow**2, speed**2)
+    )
+    if slow**2 + 2.0 * braked * bend < speed**2:
+        # Too fast already: it brakes all the way from where it is.
+        reached = np.sqrt(np.clip(speed**2 - 2.0 * braked * found.arc_length, slow**2, None))
+    # Between the preview's nodes, 0.6 m apart, the braking that begins there is spread.
+    seen = found.arc_length < bend + 4 * PERIOD * speed
+    np.testing.assert_allclose(found.speed[seen], reached[seen], atol=braked * PERIOD)
+    began = np.flatnonzero(found.speed < speed - 1e-9)[0]
+    assert found.arc_length[began] >= bend - (speed**2 - slow**2) / (2.0 * braked) - PERIOD * speed
+
+
+def test_no_reference_leaves_the_friction_circle():
+    rng, tried = np.random.default_rng(9), 0
+    for _ in range(100):
+        grip = rng.uniform(1.0, 8.0)
+        speed = np.abs(rng.uniform(5.0, 15.0) + np.cumsum(rng.uniform(-0.6, 0.6, 21)))
+        curvature = rng.uniform(-0.15, 0.15) * (rng.uniform(size=20) < 0.3)
+        row = observed(speed[0], curvature, speed[1:])
+        nodes = local_reference(row, PERIOD).arc_length
+        # A slow vehicle that accelerates at once has the reference of friction alone.
+        found = local_reference(row, PERIOD, FINE, leading=1e9, grip=grip, braking=4.0)
+        known = found.arc_length[-1] > nodes
+        passed = np.interp(nodes, found.arc_length[1:], found.speed[1:])[known]
+        assert (passed <= speed[known] + 1e-2).all()
+        tried += int((passed < speed[known] - 0.1).any())
+        for k in range(len(passed) - 1):
+            first, last = passed[k], passed[k + 1]
+            along = (last**2 - first**2) / (2.0 * (nodes[k + 1] - nodes[k]))
+            assert max(first, last) ** 2 * abs(curvature[k]) < 1.01 * grip
+            assert math.hypot(min(first, last) ** 2 * curvature[k], along) < 1.01 * grip + 0.05
+    assert tried > 50
 
 
 def test_a_vehicle_that_heads_elsewhere_is_led_as_one_that_is_slow():

@@ -310,16 +310,16 @@ def test_stages_of_any_length() -> None:
     np.testing.assert_allclose(followed, plan[[1, 2, 3, 3, 4, 4]], rtol=1e-6)
 
 
-@pytest.mark.parametrize("settings", [{}, {"stages": UNEVEN}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"stages": UNEVEN}, {"friction": 0.1}], ids=str)
 def test_the_compiled_problem_is_that_of_the_situation(settings: dict[str, Any]) -> None:
     """State and reference of a solve, which the solvers by CasADi get from Python."""
     agent = made(**settings)
-    stages = layout.working_space(agent.problem.horizon, 1)[0][0]
+    stages, lanes = (space[0] for space in layout.working_space(agent.problem.horizon, 1))
     for row in drives(17, 1)[0].astype(np.float64):
         for lateral in (row[5], 1.7, -6.0):
             row[5] = lateral
             state, _, reference = agent.situation(agent.task.layout.unpack(row))
-            assert rti.load_observation(row, agent.solver.constants, stages)
+            assert rti.load_observation(row, agent.solver.constants, stages, lanes)
             found = stages[:, layout.REFERENCE : layout.REFERENCE_Y + 1]
             np.testing.assert_allclose(found, reference, atol=1e-12)
             np.testing.assert_array_equal(stages[0, layout.PLAN_VX : layout.PLAN_Y + 1], state)
