@@ -34,7 +34,8 @@ class TrackingWeights:
     """Diagonals of the cost: Q (stage) and S (terminal) on [vx, psi, X, Y], R and R_rate on inputs.
 
     X and Y are positions along and across the path. R weighs [a, delta], R_rate their rates [jerk,
-    steering rate]; `agents.nmpc.problem` has units.
+    steering rate]; agents add a weight on lateral jerk to the latter, which grows with the speed
+    (`NmpcProblem.weights_at`). `agents.nmpc.problem` has units.
 
     Only their ratios affect the plan. The defaults track all six trajectories within centimetres.
     Heading has a tenth of the weight of position: a car drives through a bend with sideslip, so a
@@ -48,7 +49,7 @@ class TrackingWeights:
 
     Q: tuple[float, float, float, float] = (1.0, 1.0, 10.0, 10.0)
     S: tuple[float, float, float, float] = (5.0, 5.0, 50.0, 50.0)
-    R: tuple[float, float] = (0.01, 1.0)
+    R: tuple[float, float] = (0.01, 0.5)
     R_rate: tuple[float, float] = (0.001, 0.06)
 
     def __post_init__(self) -> None:

@@ -64,7 +64,8 @@ class SolvedNmpc(NmpcAgent[NmpcMemory]):
         state, last, reference = self.situation(observation)
         flat = np.concatenate([np.ravel(entry) for entry in observation]).astype(np.float64)
         self.switching.choose(flat[None], self.preview_steps, memory.band, memory.weights)
-        solution, warm = self.solver.solve(state, last, reference, memory.weights[0], memory.warm)
+        weights = self.problem.weights_at(memory.weights[0], float(state[0]))
+        solution, warm = self.solver.solve(state, last, reference, weights, memory.warm)
         memory.solution = solution
         if solution.status is Status.SUCCESS and solution.inputs is not None:
             memory.warm, memory.plan, memory.age, memory.failures = warm, solution.inputs, 0, 0

@@ -22,6 +22,10 @@ per T0 = 0.05 s, the period for which the weights were first chosen: so weights 
 the same for stages of any length and number. The paper's cost is that of stages of T0 without
 R_rate, which it has not.
 
+Every solver takes the weights as they are given; the agents schedule one of them over the measured
+speed (`NmpcProblem.weights_at`): to the weight on the steering rate comes one on lateral jerk, so
+that weights which are brisk at 5 m/s do not make a fast car with stiff tyres weave.
+
 A soft constraint may be violated by a slack s >= 0 at a cost of linear s + 1/2 quadratic s^2. This
 penalty is exact for multipliers below `linear`, so slack is used only where the path demands the
 impossible (the limit on vy alone bounds the curvature, see the errata). On vx' `linear` is 0 by
@@ -48,6 +52,9 @@ Array = NDArray[np.float64]
 STATES, INPUTS, OUTPUTS, SOFT = 6, 2, 4, 3
 NOMINAL_PERIOD = 0.05
 """T0, s: a stage of this length has the cost of its weights."""
+STEERING_GAIN = 30.0
+"""Gain of lateral acceleration by steering angle, m/s^2, at which the weight on the steering rate
+is twice that at standstill."""
 RK4_STABILITY = 2.78
 """Largest product of step and pole for which classic Runge-Kutta is stable (real poles)."""
 HORIZON = Whole(1, MOST_STEPS)
@@ -57,6 +64,18 @@ PERIOD, PENALTY = Number(0.0, 10.0, "s", above=True), Number(0.0, 1e12)
 
 LARGEST = 1e9
 """Largest magnitude, in SI units, of a number that solves start from."""
+
+
+def steering_rate_factor(vx: float, wheelbase: float, understeer: float) -> float:
+    """Return the factor of the weight on the steering rate at a speed vx, m/s.
+
+    It is 1 + (G / `STEERING_GAIN`)^2 with the steady gain G = vx^2 / (L + K vx^2) of the lateral
+    acceleration (Rajamani, Vehicle Dynamics and Control, section 3.3): its second part weighs
+    (G delta')^2, lateral jerk. An oversteering car's gain is bounded by 2 vx^2 / L.
+    """
+    squared = vx * vx
+    gain = squared / max(wheelbase + understeer * squared, 0.5 * wheelbase)
+    return 1.0 + (gain / STEERING_GAIN) ** 2
 
 
 class Status(Enum):
@@ -143,6 +162,13 @@ class NmpcProblem:
                 raise ValueError(f"{name} must have shape {shape}, not {np.shape(value)}")
         packed = np.concatenate([np.ravel(value) for value in given.values()])
         return packed if (np.abs(packed) <= LARGEST).all() else None  # NaN is not, either
+
+    def weights_at(self, weights: Array, vx: float) -> Array:
+        """Return weights (12,) scheduled over the speed vx, m/s: a copy."""
+        car, scheduled = self.vehicle, weights.copy()
+        vx = min(abs(vx), car.speed_range[1])
+        scheduled[-1] *= steering_rate_factor(vx, car.wheelbase, car.understeer_gradient)
+        return scheduled
 
     @property
     def periods(self) -> Array:

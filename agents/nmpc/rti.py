@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from agents.nmpc import layout as L
 from agents.nmpc.linearisation import acceleration, advance, differentiate, taken
+from agents.nmpc.problem import steering_rate_factor
 from agents.nmpc.qp import (
     CODE,
     COST,
@@ -30,6 +31,7 @@ from agents.nmpc.qp import (
     solve_qp,
 )
 from agents.reference import NODE, fill_leading_nodes
+from agents.weights import WEIGHTS
 from lpv_track_env import observation as entry
 from trajectories.compilation import (
     compiled,
@@ -40,6 +42,8 @@ from trajectories.compilation import (
 
 Array = NDArray[Any]
 Float = Any
+
+factor_at = compiled_internal(steering_rate_factor)
 
 SHORTENINGS = 3
 """Halvings of a step that the line search tries at most."""
@@ -238,6 +242,19 @@ def load_observation(observation: Array, constants: Array, stages: Array, lanes:
     return True
 
 
+@compiled_internal
+def schedule_weights(weights: Array, vx: Float, p: Array, scheduled: Array) -> None:
+    """Fill `scheduled` with weights (12,) at a speed vx, as `NmpcProblem.weights_at` returns them.
+
+    `p` are the constants of the solver.
+    """
+    for k in range(WEIGHTS):
+        scheduled[k] = weights[k]
+    wheelbase = p[2] + p[3]
+    understeer = p[0] * (p[3] * p[5] - p[2] * p[4]) / (wheelbase * p[4] * p[5])
+    scheduled[WEIGHTS - 1] *= factor_at(min(abs(vx), p[L.HIGH_SPEED]), wheelbase, understeer)
+
+
 @compiled
 def bound_action(a: Float, delta: Float, constants: Array, action: Array) -> None:
     """Write an action, rounded to float32 and clipped to the action space."""
@@ -282,7 +299,10 @@ def control(
                     delta += shift[i] * (plans[row, ahead, 1] - delta)
                 stages[i, L.PLAN_A], stages[i, L.PLAN_DELTA] = a, delta
             own = row if weights.shape[0] > 1 else 0
-            code = solve(stages, lanes, last_a, last_delta, weights[own], constants, stats[row])
+            # The last stage only has a state: its first entries hold the scheduled weights.
+            vx = observations[j, entry.LONGITUDINAL_SPEED]
+            schedule_weights(weights[own], vx, constants, stages[n])
+            code = solve(stages, lanes, last_a, last_delta, stages[n], constants, stats[row])
         stats[row, CODE] = code
         if code != SUCCESS:
             flags[row, WARM] = 0

@@ -325,6 +325,16 @@ def test_the_compiled_problem_is_that_of_the_situation(settings: dict[str, Any])
             np.testing.assert_array_equal(stages[0, layout.PLAN_VX : layout.PLAN_Y + 1], state)
 
 
+def test_compiled_weights_are_scheduled_as_the_problem_says() -> None:
+    agent, scheduled = made(), np.zeros(layout.STAGE)
+    weights = np.arange(1.0, 13.0)
+    for vx in (-3.0, 0.0, 7.0, 29.0, 1e6):
+        rti.schedule_weights(weights, vx, agent.solver.constants, scheduled)
+        np.testing.assert_allclose(
+            scheduled[:12], agent.problem.weights_at(weights, vx), rtol=1e-14
+        )
+
+
 def test_mirrored_observations_have_mirrored_actions() -> None:
     rows = drives(17, 2)
     sign = np.concatenate([[1, -1, -1, 1, -1, -1, -1, 1], -np.ones(20), np.ones(20)])

@@ -4,6 +4,7 @@ import inspect
 import math
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -19,10 +20,11 @@ from agents.nmpc.rti_solver import RtiSolver
 from agents.registry import agent_class
 from agents.weight_tuning.agent import TunedNmpc
 from agents.weights import TrackingWeights, WeightSchedule
+from lpv_track_env.bicycle import casadi_derivative
 from lpv_track_env.conditions import IDEAL
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.observation import ObservationLayout
-from lpv_track_env.vehicle import M2_MINIBUS
+from lpv_track_env.vehicle import M2_MINIBUS, VEHICLES, VehicleParameters
 from trajectories import CurvatureBands
 
 SET = {"Q": [1, 1, 20, 20], "S": [5, 5, 100, 100], "R": [0.01, 1]}
@@ -205,3 +207,25 @@ def test_inputs_are_bounded_by_what_the_tyres_follow() -> None:
     np.testing.assert_array_equal(dry, NmpcProblem(M2_MINIBUS).input_bounds)
     constants = RtiSolver(NmpcProblem(M2_MINIBUS, friction=0.2)).constants
     np.testing.assert_array_equal(constants[[layout.LOW_A, layout.HIGH_A]], [low[0], high[0]])
+
+
+@pytest.mark.parametrize("car", VEHICLES.values(), ids=list(VEHICLES))
+def test_steering_rate_weighs_lateral_jerk_at_speed(car: VehicleParameters) -> None:
+    """The gain is that of a steady turn of the model, solved with CasADi's linearisation."""
+    problem, weights = NmpcProblem(car), np.arange(1.0, 13.0)
+    state, action = ca.SX.sym("x", 6), ca.SX.sym("u", 2)
+    field = casadi_derivative(state, action, car)
+    slopes = ca.Function(
+        "slopes", [state, action], [ca.jacobian(field, state), ca.jacobian(field, action)]
+    )
+    highest = car.speed_range[1]
+    for vx in (0.0, 2.0, 0.5 * highest, highest):
+        gain = 0.0
+        if vx > 0.0:
+            by_state, by_input = slopes([vx, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0])
+            lateral = np.array(by_state)[np.ix_([1, 3], [1, 3])]
+            gain = -vx * np.linalg.solve(lateral, np.array(by_input)[[1, 3], 1])[1]
+        scheduled = problem.weights_at(weights, vx)
+        assert scheduled[11] == pytest.approx(12.0 * (1.0 + (gain / 30.0) ** 2), rel=1e-9)
+        np.testing.assert_array_equal(scheduled[:11], weights[:11])
+    assert weights[11] == 12.0
