@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.speed_cap import SHARE, cap_speeds, capped_interval
 from lpv_track_env.observation import TrackingObservation
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.compilation import compiled, compiled_internal
@@ -22,17 +23,14 @@ Array = NDArray[Any]
 NODE_SPEED, NODE_HEADING, NODE_X, NODE_Y, NODE_ARC_LENGTH = range(5)
 NODE = 5
 """Number of columns of a node."""
-LEAD, SHARE = 0.3, 0.8
-"""Speed (m/s) by which nodes are faster than a slow vehicle that they lead, and share of its
-largest acceleration: less than all, so that it can catch up with them."""
+LEAD = 0.3
+"""Speed by which nodes are faster than a slow vehicle that they lead, m/s."""
 NEAR_PATH = 0.5
 """Lateral error, m, up to which a predictive controller heads for the path itself."""
 APPROACH_SLOPE = 0.4
 """Largest tangent of the angle to the path at which a vehicle far from it approaches."""
 APPROACH_TIME, SHORTEST_APPROACH = 0.5, 2.0
 """Least length over which the offset of an approach decays: time at the vehicle's speed, s; m."""
-GRIP_SHARE, BRAKING_SHARE = 0.92, 0.6
-"""Share of mu g that a reference takes at most, and share of that by which it slows down."""
 
 
 class LocalReference(NamedTuple):
@@ -167,72 +165,6 @@ def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, no
 
 
 @compiled_internal
-def exceeds(
-    curvature: Array, first_speed: Any, speed: Array, period: Any, steps: int, grip: Any
-) -> bool:
-    """Return whether the acceleration of a preview exceeds `grip` (m/s^2) in its first `steps`."""
-    before, largest = first_speed, 0.0
-    for k in range(steps):
-        after = float(speed[k])
-        fastest = max(before, after)
-        turning, gain = fastest * fastest * float(curvature[k]), (after - before) / period
-        largest = max(largest, turning * turning + gain * gain)
-        before = after
-    return bool(largest > grip * grip)
-
-
-@compiled_internal
-def left_by(turning: Any, grip: Any) -> Any:
-    """Return what a lateral acceleration leaves of the friction circle, m/s^2."""
-    return math.sqrt(max(grip * grip - turning * turning, 0.0))
-
-
-@compiled_internal
-def cap_speeds(
-    curvature: Array, first_speed: Any, speed: Array, period: Any, pace: Any, rate: Any, grip: Any,
-    braking: Any, capped: Array,
-) -> bool:  # fmt: skip
-    """Fill the speeds (n + 1,) at which friction lets a vehicle pass the preview's first nodes.
-
-    Returns False, with nothing filled, if the preview is slow enough.
-
-    No node is passed faster than in the preview, and on no interval is the total acceleration
-    larger than `grip` (m/s^2): bends are taken more slowly, and what they leave of the friction
-    circle brakes before and accelerates behind them. It does so as the preview does, or, where that
-    is more, with `SHARE` of `rate`, and of `braking`, but `BRAKING_SHARE` of the grip (m/s^2). Only
-    a vehicle that is too fast already, at `pace` (m/s), is braked by no more than the latter.
-    """
-    steps, squared, bend, after = capped.shape[0] - 1, math.inf, 0.0, 0.0
-    if not exceeds(curvature, first_speed, speed, period, steps, grip):
-        return False
-    slowed = min(SHARE * braking, BRAKING_SHARE * grip) * period
-    # Backwards with squares of speeds, from node to node, each with the interval behind it.
-    for k in range(steps, -1, -1):
-        before, curve = first_speed, 0.0
-        if k > 0:
-            before, curve = float(speed[k - 1]), abs(float(curvature[k - 1]))
-        if k < steps:
-            lost = min(max(before - after, slowed), period * left_by(squared * bend, grip))
-            squared += lost * (before + after)
-        squared = min(squared, before * before)
-        if squared * max(bend, curve) > grip:
-            squared = grip / max(bend, curve)
-        capped[k], after, bend = squared, before, curve
-    before, least = first_speed, max(pace, 0.0) ** 2
-    for k in range(steps + 1):
-        capped[k] = min(max(capped[k], least), before * before)
-        if k < steps:
-            after = float(speed[k])
-            left = period * left_by(capped[k] * abs(float(curvature[k])), grip)
-            gained = min(max(after - before, SHARE * rate * period), left)
-            capped[k + 1] = min(capped[k + 1], capped[k] + gained * (before + after))
-            least -= slowed * (before + after)
-            before = after
-        capped[k] = math.sqrt(capped[k])
-    return True
-
-
-@compiled_internal
 def fill_nodes_at(
     curvature: Array, first_speed: Any, speed: Array, period: Any, lengths: Array, pace: Any,
     rate: Any, grip: Any, braking: Any, capped: Array, nodes: Array,
@@ -285,24 +217,6 @@ def fill_nodes_at(
                         end, left = capped_interval(first_speed, speed, period, capped, at)
         nodes[k + 1, NODE_SPEED], nodes[k + 1, NODE_HEADING] = min(v, fastest), heading
         nodes[k + 1, NODE_X], nodes[k + 1, NODE_Y], nodes[k + 1, NODE_ARC_LENGTH] = x, y, s
-
-
-@compiled_internal
-def capped_interval(
-    first_speed: Any, speed: Array, period: Any, capped: Array, k: int
-) -> tuple[Any, Any]:
-    """Return the end speed (m/s) of interval k, and the time (s) that it takes, with `cap_speeds`.
-
-    Intervals without capped speeds keep the preview's.
-    """
-    end = float(speed[k])
-    if k + 1 >= capped.shape[0]:
-        return end, period
-    before = float(speed[k - 1]) if k > 0 else first_speed
-    slow = capped[k] + capped[k + 1]
-    if slow == before + end:
-        return end, period
-    return capped[k + 1], (before + end) * period / slow
 
 
 @compiled_internal

@@ -16,7 +16,8 @@ from agents.base import DrivingTask, TrackingAgent, blind_control
 from agents.classical.geometric import Stanley
 from agents.nmpc.problem import HORIZON, PERIOD, NmpcProblem
 from agents.nmpc.schedule import Switching
-from agents.reference import GRIP_SHARE, local_reference
+from agents.reference import local_reference
+from agents.speed_cap import GRIP_SHARE
 from agents.weights import TrackingWeights, WeightSchedule, weights_from
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
 from lpv_track_env.plausibility import GRAVITY
@@ -28,8 +29,10 @@ from trajectories.naming import choose
 Array = NDArray[np.float64]
 Memory = TypeVar("Memory")
 
-FRICTIONS = ("known", "linear")
+FRICTIONS = ("known", "estimated", "linear")
 """Words for a coefficient of friction."""
+ASPHALT = 0.8
+"""Friction to begin with where tyres and road have no limit."""
 FAILURES = Whole(0, 1_000_000_000)
 GROWTH = 1.13
 """Factor from stage to stage: from 0.05 s on, 15 stages are 2 s, the last of them 0.27 s."""
@@ -62,7 +65,8 @@ class NmpcSettings:
     friction
         Coefficient of friction of the model's tyres and, `GRIP_SHARE` of it, of the reference's
         acceleration: a number; "known", the nominal one of the environment for the tyres and the
-        least of its range for the reference; or "linear", neither has a limit.
+        least of its range for the reference; "estimated", learned from how the vehicle moves
+        (`friction`), `lpv-nmpc` and its kin alone; or "linear", neither has a limit.
     max_failures
         Failed solves in a row after which the vehicle is brought to a stop.
 
@@ -106,8 +110,20 @@ class NmpcSettings:
         """Return the coefficients of friction of the tyres and the reference; inf is no limit."""
         if not isinstance(self.friction, str):
             return self.friction, self.friction
+        if self.friction == "estimated":
+            low, high = estimated_range(task)
+            return 0.5 * (low + high), low
         known = task.friction, task.friction_range[0]
         return known if self.friction == "known" else (math.inf, math.inf)
+
+
+def estimated_range(task: DrivingTask) -> tuple[float, float]:
+    """Return the range in which friction is estimated: the task's, or one about its only value."""
+    low, high = task.friction_range
+    if low < high:
+        return low, high
+    middle = low if low < math.inf else ASPHALT
+    return 0.5 * middle, 1.5 * middle
 
 
 @dataclass
@@ -186,8 +202,18 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
         If the horizon is longer than the preview, or a setting is out of range.
     """
 
+    estimating = False
+    """True for agents that can estimate friction."""
+
     def __init__(self, task: DrivingTask, settings: NmpcSettings) -> None:
         super().__init__(task)
+        self.estimated = settings.friction == "estimated"
+        if self.estimated and not self.estimating:
+            raise ValueError(
+                f"{type(self).__name__} cannot estimate friction, only lpv-nmpc and "
+                "lpv-nmpc-tuned can: give a number, 'known' or 'linear'"
+            )
+        self.estimated_range = estimated_range(task) if self.estimated else (math.inf, math.inf)
         stages = stages_of(settings, task.layout, task.control_period)
         friction, least = settings.friction_in(task)
         self.problem = NmpcProblem(

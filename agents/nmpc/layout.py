@@ -35,9 +35,10 @@ Array = NDArray[np.float64]
     DAMPING_A, DAMPING_DELTA, TYRE,
 ) = range(7, 32)  # fmt: skip
 """From `TYRE` on the 6 constants of the tyres, see `tyres.constants`."""
-GRIP = TYRE + 6
-"""Largest total acceleration of the reference, m/s^2."""
-CONSTANTS_SIZE = GRIP + 1
+GRIP, CONTROL_PERIOD, LEAST_FRICTION, MOST_FRICTION = range(TYRE + 6, TYRE + 10)
+"""Largest total acceleration of the reference, m/s^2; the control period, s; and the range in which
+friction is estimated, which is empty if it is not."""
+CONSTANTS_SIZE = MOST_FRICTION + 1
 # Rows of `grid`, an entry a stage: its length (s), Runge-Kutta steps, length by the nominal period,
 # weight of a squared change of input by that of a squared rate, largest changes of a and delta,
 # share of the way to the next stage's input by which a plan is shifted.

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.nmpc import layout as L
+from agents.nmpc.friction import BEGUN, estimate_friction
 from agents.nmpc.linearisation import acceleration, advance, differentiate, taken
 from agents.nmpc.problem import steering_rate_factor
 from agents.nmpc.qp import (
@@ -75,6 +76,8 @@ class NmpcArrays(NamedTuple):
     """States of the last plans, (n, N + 1, 6)."""
     actions: Array
     """Last actions, (n, 2)."""
+    frictions: Array
+    """Records of the estimated frictions, (n, `friction.RECORD`)."""
 
 
 @compiled_internal
@@ -213,16 +216,20 @@ def solve(
 
 
 @compiled_internal
-def load_observation(observation: Array, constants: Array, stages: Array, lanes: Array) -> bool:
-    """Write first state and reference to the stages, in the frame of the path's foot point.
-
-    Returns False, and writes nothing, if the observation is not finite. `lanes` is working space.
-    """
+def is_finite(observation: Array) -> bool:
+    """Return whether all entries of an observation are finite."""
     total = 0.0
     for k in range(observation.shape[0]):
         total += abs(observation[k])
-    if not math.isfinite(total):
-        return False
+    return math.isfinite(total)
+
+
+@compiled_internal
+def load_observation(observation: Array, constants: Array, stages: Array, lanes: Array) -> None:
+    """Write first state and reference to the stages, in the frame of the path's foot point.
+
+    The observation is finite. `lanes` is working space.
+    """
     e, o = stages[0], observation
     e[L.PLAN_VX], e[L.PLAN_VY] = o[entry.LONGITUDINAL_SPEED], o[entry.LATERAL_SPEED]
     e[L.PLAN_PSI], e[L.PLAN_R] = o[entry.HEADING_ERROR], o[entry.YAW_RATE]
@@ -239,7 +246,25 @@ def load_observation(observation: Array, constants: Array, stages: Array, lanes:
         min(constants[L.HIGH_RATE], grip), grip, -constants[L.LOW_RATE], capped,
         stages[:, L.REFERENCE : L.REFERENCE + NODE],
     )  # fmt: skip
-    return True
+
+
+@compiled_internal
+def load_plan(
+    plan: Array, warm: bool, last_a: Float, last_delta: Float, constants: Array, stages: Array
+) -> None:
+    """Write the start of a solve to the stages: the last plan (N, 2), or the input in force, held.
+
+    The plan is shifted by the share of each stage that has passed; its end is held.
+    """
+    n = plan.shape[0]
+    shift = L.grid(constants, L.SHIFT, n)
+    for i in range(n):
+        a, delta = last_a, last_delta
+        if warm:
+            ahead, a, delta = min(i + 1, n - 1), plan[i, 0], plan[i, 1]
+            a += shift[i] * (plan[ahead, 0] - a)
+            delta += shift[i] * (plan[ahead, 1] - delta)
+        stages[i, L.PLAN_A], stages[i, L.PLAN_DELTA] = a, delta
 
 
 @compiled_internal
@@ -267,42 +292,40 @@ def bound_action(a: Float, delta: Float, constants: Array, action: Array) -> Non
 @compiled
 def control(
     first: int, observations: Array, weights: Array, constants: Array, plans: Array, flags: Array,
-    stats: Array, states: Array, actions: Array, stages: Array, lanes: Array,
+    stats: Array, states: Array, actions: Array, frictions: Array, stages: Array, lanes: Array,
 ) -> int:  # fmt: skip
     """Control some vehicles: fill their rows of `actions` (n, 2); returns how many solves failed.
 
     Observations (m, size) are those of rows first to first + m - 1 of all n. `weights` is (n, 12),
-    or (1, 12) for all. `constants` to `actions` are those of `NmpcArrays`; they are passed one by
+    or (1, 12) for all. `constants` to `frictions` are those of `NmpcArrays`; they are passed one by
     one because this is called from Python every control period. After a failure the last plan
-    stays, a period older, and no longer warm-starts. `stages` and `lanes` are working space.
+    stays, a period older, and no longer warm-starts. `stages` and `lanes` are working space, and so
+    are the tyres among the constants where friction is estimated.
     """
     n, failed = lanes.shape[1], 0
-    shift = L.grid(constants, L.SHIFT, n)
+    estimated = constants[L.LEAST_FRICTION] < constants[L.MOST_FRICTION]
     for j in range(observations.shape[0]):
         row = first + j
         code = NOT_FINITE
         for k in range(STATS):
             stats[row, k] = 0.0
         stats[row, COST] = math.nan
-        if load_observation(observations[j], constants, stages, lanes):
+        if is_finite(observations[j]):
+            if estimated:
+                estimate_friction(frictions[row], observations[j], constants)
+            load_observation(observations[j], constants, stages, lanes)
             last_a = observations[j, entry.ACCELERATION]
             last_a = min(max(last_a, constants[L.LOW_A]), constants[L.HIGH_A])
             last_delta = observations[j, entry.STEERING_ANGLE]
             last_delta = min(max(last_delta, -constants[L.MAX_DELTA]), constants[L.MAX_DELTA])
-            for i in range(n):
-                a, delta = last_a, last_delta
-                if flags[row, WARM] > 0:
-                    # Shift the plan by the share of each stage that has passed; hold its end.
-                    ahead = min(i + 1, n - 1)
-                    a, delta = plans[row, i, 0], plans[row, i, 1]
-                    a += shift[i] * (plans[row, ahead, 0] - a)
-                    delta += shift[i] * (plans[row, ahead, 1] - delta)
-                stages[i, L.PLAN_A], stages[i, L.PLAN_DELTA] = a, delta
+            load_plan(plans[row], flags[row, WARM] > 0, last_a, last_delta, constants, stages)
             own = row if weights.shape[0] > 1 else 0
             # The last stage only has a state: its first entries hold the scheduled weights.
             vx = observations[j, entry.LONGITUDINAL_SPEED]
             schedule_weights(weights[own], vx, constants, stages[n])
             code = solve(stages, lanes, last_a, last_delta, stages[n], constants, stats[row])
+        else:
+            frictions[row, BEGUN] = 0.0
         stats[row, CODE] = code
         if code != SUCCESS:
             flags[row, WARM] = 0
@@ -324,14 +347,17 @@ def control(
 @compiled_parallel
 def control_in_threads(
     chunks: int, observations: Array, weights: Array, constants: Array, plans: Array,
-    flags: Array, stats: Array, states: Array, actions: Array, stages: Array, lanes: Array,
-    failed: Array,
+    flags: Array, stats: Array, states: Array, actions: Array, frictions: Array, stages: Array,
+    lanes: Array, failed: Array,
 ) -> None:  # fmt: skip
-    """`control` for all rows, in chunks that threads share; fills `failed` (chunks,)."""
+    """`control` for all rows, in chunks that threads share; fills `failed` (chunks,).
+
+    Each thread has its own constants, into which it writes its vehicles' tyres.
+    """
     n = observations.shape[0]
     for chunk in numba.prange(chunks):
         first, last = chunk * n // chunks, (chunk + 1) * n // chunks
         failed[chunk] = control(
-            first, observations[first:last], weights, constants, plans, flags, stats, states,
-            actions, stages[chunk], lanes[chunk],
+            first, observations[first:last], weights, constants.copy(), plans, flags, stats, states,
+            actions, frictions, stages[chunk], lanes[chunk],
         )  # fmt: skip

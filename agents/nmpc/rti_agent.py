@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from agents.base import Action, DrivingTask
 from agents.inputs import memory_of, observation_rows, started_rows
-from agents.nmpc import layout, qp, rti
+from agents.nmpc import friction, layout, qp, rti
 from agents.nmpc.base import Fallback, NmpcAgent, NmpcSettings
 from agents.nmpc.problem import INPUTS, STATES, Status
 from agents.nmpc.rti_solver import DAMPING, STATUS, RtiSolver
@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 class RtiMemory:
     """Memory of n vehicles of the real-time NMPC: arrays for compiled code, a row a vehicle.
 
-    `plans`, `flags`, `stats`, `states` and `actions` are those of `rti.NmpcArrays`; with a
-    schedule, `bands` (n,) and `weights` (n, 12) are the bands and weights in use.
+    `plans` to `frictions` are those of `rti.NmpcArrays`; with a schedule, `bands` (n,) and
+    `weights` (n, 12) are the bands and weights in use.
     """
 
     def __init__(self, rows: int, horizon: int) -> None:
@@ -37,6 +37,7 @@ class RtiMemory:
         self.stats = np.zeros((rows, qp.STATS))
         self.states = np.zeros((rows, horizon + 1, STATES))
         self.actions = np.zeros((rows, INPUTS))
+        self.frictions = np.zeros((rows, friction.RECORD))
         self.bands = np.full(rows, NO_BAND)
         self.weights = np.zeros((rows, WEIGHTS))
         self.fallbacks: dict[int, Fallback] = {}
@@ -53,14 +54,16 @@ class RtiMemory:
         return RtiRow(self, row % len(self))
 
     @property
-    def arrays(self) -> tuple[Any, Any, Any, Any, Any]:
-        """Plans, flags, statistics, states and actions, as in `rti.NmpcArrays`; not copies."""
-        return self.plans, self.flags, self.stats, self.states, self.actions
+    def arrays(self) -> tuple[Any, Any, Any, Any, Any, Any]:
+        """Arrays from the plans to the frictions, as in `rti.NmpcArrays`; not copies."""
+        return self.plans, self.flags, self.stats, self.states, self.actions, self.frictions
 
     def take(self, row: int) -> "RtiMemory":
         """Return the memory of one row, as views of the same arrays; `put` puts it back."""
         alone = copy.copy(self)
-        for name in ("plans", "flags", "stats", "states", "actions", "bands", "weights"):
+        for name in (
+            "plans", "flags", "stats", "states", "actions", "frictions", "bands", "weights",
+        ):  # fmt: skip
             setattr(alone, name, getattr(self, name)[row : row + 1])
         alone.fallbacks = {0: self.fallbacks[row]} if row in self.fallbacks else {}
         return alone
@@ -74,6 +77,7 @@ class RtiMemory:
     def clear(self, row: int) -> None:
         """Clear a row: a new episode begins there."""
         self.flags[row] = 0
+        self.frictions[row] = 0.0
         self.bands[row] = NO_BAND
         self.weights[row] = 0.0
         self.fallbacks.pop(row, None)
@@ -112,6 +116,8 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         If the horizon is longer than the preview, or a setting is out of range.
     """
 
+    estimating = True
+
     @forwards_arguments(NmpcSettings)
     def __init__(
         self,
@@ -129,7 +135,8 @@ class RtiNmpc(NmpcAgent[RtiRow]):
         )  # fmt: skip
         space = slice(layout.SPACE_LOW_A, layout.SPACE_HIGH_DELTA + 1)
         self.solver.constants[space] = [*self._low, *self._high]
-        self.solver.constants[layout.GRIP] = self.grip
+        known = slice(layout.GRIP, layout.MOST_FRICTION + 1)
+        self.solver.constants[known] = self.grip, task.control_period, *self.estimated_range
         self._threads = checked_threads(threads)
         self._work = layout.working_space(self.problem.horizon, shares(self._threads))
         self._memory: RtiMemory | None = None
@@ -249,4 +256,5 @@ class RtiNmpc(NmpcAgent[RtiRow]):
             "fallback": "" if solved or fallback is None else fallback.used,
             "plan": batch.states[row, :, 4:].copy() if solved else None,
             "weights": (batch.weights[row] if self.has_schedule else self.fixed_weights[0]).copy(),
+            "friction": float(batch.frictions[row, friction.MEAN]) if self.estimated else None,
         }

@@ -207,7 +207,7 @@ class RtiSolver:
                 *np.array(problem.quadratic_penalty)[order],
                 *self.damping,
                 *tyres.of(car, problem.friction),
-                math.inf,
+                *(math.inf, first, math.inf, math.inf),
                 *periods,
                 *problem.substeps,
                 *(periods / NOMINAL_PERIOD),

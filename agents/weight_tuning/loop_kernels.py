@@ -192,7 +192,7 @@ def act(
         failed = rti.control(
             row, memory.nmpc_observations[row : row + 1], weights.in_use[row : row + 1],
             nmpc.constants, nmpc.plans, nmpc.flags, nmpc.stats, nmpc.states, nmpc.actions,
-            work.stages, work.lanes,
+            nmpc.frictions, work.stages, work.lanes,
         )  # fmt: skip
         run.tally[row, ITERATIONS] += nmpc.stats[row, INNER]
         run.tally[row, SOLVES] += 1.0
@@ -276,7 +276,12 @@ def drive_in_threads(
     for chunk in numba.prange(chunks):
         drive_rows(
             chunk * n // chunks, (chunk + 1) * n // chunks, periods, until_band, envs, conditions,
-            memory, weights, policy, nmpc, run,
+            memory, weights, policy,
+            NmpcArrays(
+                nmpc.constants.copy(), nmpc.plans, nmpc.flags, nmpc.stats, nmpc.states,
+                nmpc.actions, nmpc.frictions,
+            ),
+            run,
             Workspace(
                 work.nodes[chunk], work.layers[chunk], work.stages[chunk], work.lanes[chunk],
                 work.filter[chunk],

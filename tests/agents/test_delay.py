@@ -105,7 +105,7 @@ def test_it_slides_as_the_vehicle_does() -> None:
         ),
     )  # fmt: skip
     task = DrivingTask.of(env)
-    linear = NearFuture(dataclasses.replace(task, friction=math.inf), env.actuation)
+    linear = NearFuture(dataclasses.replace(task, friction_range=(math.inf,) * 2), env.actuation)
     listener = Listener(task, np.zeros((0, 2)))
     agent = DelayCompensated(listener, task, env.actuation)
     observation, _ = env.reset(seed=0)

@@ -11,7 +11,6 @@ from agents.reference import (
     LEAD,
     NEAR_PATH,
     NODE,
-    SHARE,
     early_turn,
     fill_nodes,
     fill_nodes_at,
@@ -22,6 +21,7 @@ from agents.reference import (
     steady_turn,
     transient_turn,
 )
+from agents.speed_cap import SHARE
 from lpv_track_env import bicycle
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
 from lpv_track_env.vehicle import VEHICLES
