@@ -214,8 +214,8 @@ class _NlpSolver(ABC):
     ) -> tuple[Solution, Any]:
         """Solve from `state` (6,), with the input in force (2,) and the weights (12,).
 
-        `reference` is (N + 1, 4). `warm` is the warm start that the last solve returned, shifted by
-        one stage here. Never raises: the status reports failures.
+        `reference` is (N + 1, 4). `warm` is the warm start that the last solve returned, moved on
+        by one control period here. Never raises: the status reports failures.
         """
         began = time.perf_counter()
         parameters = self.problem.parameters(state, last_input, reference, weights)
@@ -224,7 +224,7 @@ class _NlpSolver(ABC):
         if warm is None:
             guess, solver = {"x0": self._cold_guess(state, last_input)}, self._cold_solver
         else:
-            guess, solver = self._shifted(warm), self._warm_solver
+            guess, solver = self._moved_on(warm, state), self._warm_solver
         return self._run(solver, guess, parameters, began)
 
     def _run(
@@ -258,14 +258,29 @@ class _NlpSolver(ABC):
         guess = np.zeros((self.problem.horizon, self.GROUP))
         for columns in self.INPUT:
             guess[:, columns] = held
-        for row, model in zip(guess, self._models, strict=True):
-            row[self.STATE] = state = np.asarray(model(state, held)).ravel()
+        self._roll_out(guess, state)
         return (guess if np.isfinite(guess).all() else np.zeros_like(guess)).ravel()
 
-    def _shifted(self, warm: dict[str, Array]) -> dict[str, Array]:
-        """Shift a warm start by one stage; the last one is repeated."""
-        stages = {name: values.reshape(self.problem.horizon, -1) for name, values in warm.items()}
-        return {name: np.vstack([rows[1:], rows[-1:]]).ravel() for name, rows in stages.items()}
+    def _moved_on(self, warm: dict[str, Array], state: Array) -> dict[str, Array]:
+        """Move a warm start on by one control period, its inputs rolled out from the new state.
+
+        What belongs to a stage goes towards that of the next by the share of the stage that has
+        passed; the last stage's is held. The roll-out replaces states in the frame of the old foot
+        point.
+        """
+        moved = {}
+        for name, values in warm.items():
+            stages = values.reshape(self.problem.horizon, -1).copy()
+            stages[:-1] += self.problem.passed[:-1, None] * (stages[1:] - stages[:-1])
+            moved[name] = stages.ravel()
+        rolled = moved["x0"].reshape(self.problem.horizon, self.GROUP).copy()
+        self._roll_out(rolled, state)
+        return {**moved, "x0": rolled.ravel()} if np.isfinite(rolled).all() else moved
+
+    def _roll_out(self, groups: Array, state: Array) -> None:
+        """Fill the states of groups (N, `GROUP`) with the motion under their inputs."""
+        for row, model in zip(groups, self._models, strict=True):
+            row[self.STATE] = state = np.asarray(model(state, row[self.INPUT[0]])).ravel()
 
 
 class IpoptSolver(_NlpSolver):

@@ -202,6 +202,13 @@ class NmpcProblem:
         return 0.5 * (periods + before)
 
     @property
+    def passed(self) -> Array:
+        """Share of each stage that has passed when the next plan is made, (N,)."""
+        periods, first = self.periods, self.first_period
+        shares: Array = np.minimum((periods[0] if first is None else first) / periods, 1.0)
+        return shares
+
+    @property
     def input_bounds(self) -> tuple[Array, Array]:
         """Lower and upper bound of u, each (2,): accelerations that the tyres follow, too."""
         low, high = self.vehicle.acceleration_range

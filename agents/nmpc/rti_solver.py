@@ -188,7 +188,6 @@ class RtiSolver:
         self.problem = instance_of("problem", problem, NmpcProblem, "an NmpcProblem")
         self.damping = numbers("damping", damping, Number(0.0, 1e9), INPUTS)
         car, order, periods = problem.vehicle, np.array(L.SLACK_OF), problem.periods
-        first = periods[0] if problem.first_period is None else problem.first_period
         preview = periods[0] if preview_period is None else preview_period
         self.constants = np.array(
             [
@@ -213,7 +212,7 @@ class RtiSolver:
                 *(periods / NOMINAL_PERIOD),
                 *(1.0 / (problem.spacings * NOMINAL_PERIOD)),
                 *problem.input_steps.T.ravel(),
-                *np.minimum(first / periods, 1.0),
+                *problem.passed,
             ],
             dtype=np.float64,
         )

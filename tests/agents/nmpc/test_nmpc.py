@@ -18,6 +18,7 @@ from agents.base import DrivingTask
 from agents.nmpc.casadi_solvers import IpoptSolver, discrete_model
 from agents.nmpc.ipopt_agent import IpoptNmpc
 from agents.nmpc.problem import NmpcProblem, Solution, Status
+from agents.nmpc.rti_solver import RtiSolver
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments.run.case import run_case
 from lpv_track_env.bicycle import derivative
@@ -217,6 +218,26 @@ def test_warm_start_changes_the_work_not_the_answer(solver: IpoptSolver) -> None
     assert again.inputs is not None
     np.testing.assert_allclose(again.inputs, cold.inputs, atol=1e-5)
     assert again.iterations < cold.iterations
+
+
+def test_a_warm_start_moves_on_by_a_control_period(uneven: IpoptSolver) -> None:
+    """Its inputs as in real-time iterations; its states are the motion under them from now on."""
+    state, last, reference = random_situation(np.random.default_rng(3), uneven.problem)
+    plan, warm = uneven.solve(state, last, reference, WEIGHTS)
+    assert plan.inputs is not None
+    state = runge_kutta(state, plan.inputs[0], M2_MINIBUS, 0.05, 5)
+    moved = uneven._moved_on(warm, state)
+    groups = moved["x0"].reshape(12, -1)
+    wanted = RtiSolver(uneven.problem).shifted(plan.inputs)
+    np.testing.assert_array_equal(groups[:, :2], wanted)
+    for i in range(12):
+        state = runge_kutta(
+            state, wanted[i], M2_MINIBUS, uneven.problem.periods[i], uneven.problem.substeps[i]
+        )
+        np.testing.assert_allclose(groups[i, 5:], state, atol=1e-9)
+    before, after = (values["lam_g0"].reshape(12, -1) for values in (warm, moved))
+    share = 0.05 / uneven.problem.periods[5]
+    np.testing.assert_allclose(after[5], (1.0 - share) * before[5] + share * before[6])
 
 
 @pytest.mark.parametrize("stages", ["solver", "uneven"])

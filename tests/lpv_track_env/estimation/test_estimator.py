@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 CAR = VEHICLES["m2-minibus"]
 SETTINGS = EstimatorSettings()
 RUNS, PERIODS, PERIOD = 25, 300, 0.05
-TYRES = pytest.mark.parametrize("friction", [math.inf, 0.3])
-"""The linear tyre, and one whose axles slide up to 0.9 of their patches in these drives."""
+TYRES = pytest.mark.parametrize("friction", [math.inf, 0.15])
+"""The linear tyre, and one that slides on up to 0.7 of its patch in these drives."""
 
 
 def simulated(
