@@ -59,7 +59,9 @@ WARM_OPTIONS: dict[str, Any] = {
     "mu_init": 1e-3,
     "mu_strategy": "adaptive",  # 5 iterations a solve where the monotone strategy takes 13
 }
-FATROP_ITERATIONS = 200
+FATROP_ITERATIONS = 300
+ASIDE = 0.01
+"""Steering angle added to a cold start's, rad."""
 TOLERANCE = Number(0.0, 1.0, above=True)
 RELAXATION = 1e-8
 """fatrop relaxes every bound b by RELAXATION max(1, |b|), which none of its options turns off."""
@@ -222,7 +224,8 @@ class _NlpSolver(ABC):
         if parameters is None:
             return Solution(Status.NAN), None
         if warm is None:
-            guess, solver = {"x0": self._cold_guess(state, last_input)}, self._cold_solver
+            guess = {"x0": self._cold_guess(state, last_input, reference)}
+            solver = self._cold_solver
         else:
             guess, solver = self._moved_on(warm, state), self._warm_solver
         return self._run(solver, guess, parameters, began)
@@ -251,13 +254,24 @@ class _NlpSolver(ABC):
     def _status(self, statistics: dict[str, Any]) -> Status:
         """Status of a solve by CasADi's statistics."""
 
-    def _cold_guess(self, state: Array, last_input: Array) -> Array:
-        """Guess without a plan: the motion of the model under the input in force, held."""
-        low, high = self.problem.input_bounds
-        held = last_input.clip(low, high)
-        guess = np.zeros((self.problem.horizon, self.GROUP))
-        for columns in self.INPUT:
-            guess[:, columns] = held
+    def _cold_guess(self, state: Array, last_input: Array, reference: Array) -> Array:
+        """Guess without a plan: the model driven towards the reference's speed, wheels held.
+
+        They are held `ASIDE`: where a car that drives off straight could gain by either turn, the
+        symmetric plan is stationary without being a minimum, and solvers end there.
+        """
+        problem, car = self.problem, self.problem.vehicle
+        low, high = problem.input_bounds
+        a, delta = last_input + np.array([0.0, ASIDE])
+        speed, rolling = state[0], car.rolling_deceleration
+        guess = np.zeros((problem.horizon, self.GROUP))
+        for i, (length, most) in enumerate(zip(problem.periods, problem.input_steps, strict=True)):
+            wanted = (reference[i + 1, 0] - speed) / length
+            wanted = rolling + min(wanted, car.longitudinal_acceleration_range[1])
+            a = min(max(wanted, a - most[0], low[0]), a + most[0], high[0])
+            speed += length * (a - rolling)
+            for columns in self.INPUT:
+                guess[i, columns] = a, min(max(delta, low[1]), high[1])
         self._roll_out(guess, state)
         return (guess if np.isfinite(guess).all() else np.zeros_like(guess)).ravel()
 

@@ -140,3 +140,18 @@ def test_a_build_without_fatrop_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
         agents.make("lpv-nmpc-ipopt", env, solver="fatrop")
     with pytest.raises(ValueError, match="known: ipopt, fatrop"):
         agents.make("lpv-nmpc-ipopt", env, solver="fatrope")
+
+
+@pytest.mark.parametrize("solver", ["fatrop", "ipopt"])
+def test_from_rest_on_a_straight_it_drives_off(solver: str) -> None:
+    """There the symmetric plan is a stationary point, at which fatrop used to stay."""
+    env = gymnasium.make(ID, trajectory="T1")
+    observation, _ = env.reset(seed=0, options={"arc_length": 7.0, "speed": 0.0})
+    agent, memory = agents.make("lpv-nmpc-ipopt", env, solver=solver), None
+    for step in range(3):
+        action, memory = agent.predict(observation, memory, np.array([step == 0]))
+        shown = agent.diagnostics(memory[0])
+        assert shown["status"] == "SUCCESS"
+        assert shown["iterations"] < 250
+        assert shown["plan"][-1, 0] > 2.0
+        observation, *_ = env.step(action)
