@@ -188,6 +188,7 @@ class RtiSolver:
         self.problem = instance_of("problem", problem, NmpcProblem, "an NmpcProblem")
         self.damping = numbers("damping", damping, Number(0.0, 1e9), INPUTS)
         car, order, periods = problem.vehicle, np.array(L.SLACK_OF), problem.periods
+        first = periods[0] if problem.first_period is None else problem.first_period
         preview = periods[0] if preview_period is None else preview_period
         self.constants = np.array(
             [
