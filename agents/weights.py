@@ -48,7 +48,7 @@ class TrackingWeights:
     """
 
     Q: tuple[float, float, float, float] = (1.0, 1.0, 10.0, 10.0)
-    S: tuple[float, float, float, float] = (5.0, 5.0, 50.0, 50.0)
+    S: tuple[float, float, float, float] = (10.0, 10.0, 100.0, 100.0)
     R: tuple[float, float] = (0.01, 0.5)
     R_rate: tuple[float, float] = (0.001, 0.06)
 
