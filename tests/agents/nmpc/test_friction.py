@@ -74,7 +74,7 @@ def estimates(agent: Any, rows: list[NDArray[np.float64]]) -> NDArray[np.float64
         assert constants[layout.TYRE : layout.TYRE + 6] == pytest.approx(
             tyres.of(agent.problem.vehicle, record[friction.MEAN]), rel=1e-12
         )
-        assert constants[layout.GRIP] == pytest.approx(0.92 * 9.81 * record[friction.CAUTIOUS])
+        assert constants[layout.GRIP] == pytest.approx(0.88 * 9.81 * record[friction.CAUTIOUS])
         found.append(record.copy())
     return np.array(found)
 

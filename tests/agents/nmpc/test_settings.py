@@ -189,7 +189,7 @@ def test_friction_is_the_environments_a_number_or_none(name: str) -> None:
     ):
         agent = agents.make(name, env, **settings)
         assert agent.problem.friction == tyres
-        assert agent.grip == pytest.approx(0.92 * least * 9.81)
+        assert agent.grip == pytest.approx(0.88 * least * 9.81)
     for bad, message in (
         ("dry", r"friction 'dry'.*known, estimated, linear"),
         (0.0, r"friction must be in \[0.001, inf\]"),
