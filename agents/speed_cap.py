@@ -17,7 +17,7 @@ Array = NDArray[Any]
 SHARE = 0.8
 """Share of a vehicle's largest acceleration and deceleration that a reference takes: less than all,
 so that it can catch up."""
-GRIP_SHARE = .88
+GRIP_SHARE = 0.88
 """Share of mu g that a reference takes at most."""
 BRAKING_SHARE = 0.6
 """Share of that by which it slows down."""

@@ -25,6 +25,11 @@ from trajectories.arguments import shown
 from trajectories.fileio import checked, parse_json, read_bytes, read_json, write_atomically
 
 SETTINGS, PROGRESS, VERSIONS = "settings.json", "progress.jsonl", "versions.json"
+JOBS, FIRST = "lpv-track-env jobs", "1"
+"""Name of the version of what jobs compute, and the version of files that do not name it."""
+JOBS_VERSION = "2"
+"""It counts up with every change of environments or of the NMPC after which a job learns another
+thing: 2 has a preview of 2 s, stages that grow, and weights on the rates of inputs."""
 
 Line = dict[str, Any]
 
@@ -144,20 +149,31 @@ def claimed(
     """
     with locked(folder):
         stored = stored_settings(folder, kind)
+        file = folder / VERSIONS
+        own = {JOBS: JOBS_VERSION, **computing_versions(*COMPUTING, *packages)}
+        # A user who removes the file goes on all the same.
+        kept = stored is not None and file.exists()
+        if kept:
+            _check_versions(folder, kind, own)
         if stored is not None and (differs := difference(settings, stored)):
-            raise ValueError(f"{folder} holds a {kind} with other settings: {differs}")
-        _check_versions(folder, kind, packages, begun=stored is not None)
+            raise ValueError(
+                f"{folder} holds a {kind} with other settings: {differs}: give the same options, "
+                "or another --out"
+            )
+        if not kept:
+            write_atomically(file, json.dumps(own, indent=2).encode())
         yield stored is not None
 
 
-def _check_versions(folder: Path, kind: str, packages: Sequence[str], *, begun: bool) -> None:
-    """Write the versions of what computes, or compare them with those that a job began with."""
-    file, own = folder / VERSIONS, computing_versions(*COMPUTING, *packages)
-    if not (begun and file.exists()):
-        # A folder of an earlier version of this project has no such file.
-        write_atomically(file, json.dumps(own, indent=2).encode())
-        return
+def _check_versions(folder: Path, kind: str, own: Mapping[str, str]) -> None:
+    """Compare the versions of what computes with those that a job began with."""
+    file = folder / VERSIONS
     begun_with = checked(read_json(file), dict[str, str], file)
+    if begun_with.get(JOBS, FIRST) != own[JOBS]:
+        raise ValueError(
+            f"{folder} holds a {kind} of another version of lpv-track-env, whose preview and NMPC "
+            f"differ: give another --out to begin anew, or go on with that version"
+        )
     for name, version in own.items():
         if (then := begun_with.get(name, version)) != version:
             raise ValueError(

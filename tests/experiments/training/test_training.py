@@ -19,6 +19,7 @@ from agents.learned.policy import read as read_policy
 from experiments import cli
 from experiments.jobs import checkpoint
 from experiments.jobs.job import (
+    JOBS,
     TRAINING_EPISODES,
     TRAINING_PATHS,
     VALIDATION_EPISODES,
@@ -407,7 +408,11 @@ def test_a_training_made_with_other_versions_is_not_gone_on_with(tmp_path: Path)
     with pytest.raises(ValueError, match=f"made with numpy 1.0.0, here is {own['numpy']}: "):
         run(settings, tmp_path)
     # A package that was not there then could not compute anything; older folders have no versions.
-    (tmp_path / VERSIONS).write_text(json.dumps({"numpy": own["numpy"]}))
+    earlier = {name: version for name, version in own.items() if name != JOBS}
+    (tmp_path / VERSIONS).write_text(json.dumps(earlier))
+    with pytest.raises(ValueError, match="of another version of lpv-track-env, whose preview and"):
+        run(settings, tmp_path)
+    (tmp_path / VERSIONS).write_text(json.dumps({JOBS: own[JOBS], "numpy": own["numpy"]}))
     run(settings, tmp_path)
     (tmp_path / VERSIONS).unlink()
     run(settings, tmp_path)
