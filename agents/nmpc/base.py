@@ -64,9 +64,9 @@ class NmpcSettings:
         Penalties of slack on (vx, vy, vx'), see `NmpcProblem`.
     friction
         Coefficient of friction of the model's tyres and, `GRIP_SHARE` of it, of the reference's
-        acceleration: a number; "known", the nominal one of the environment for the tyres and the
-        least of its range for the reference; "estimated", learned from how the vehicle moves
-        (`friction`), `lpv-nmpc` and its kin alone; or "linear", neither has a limit.
+        acceleration: a number; "known", the environment's, of a range the least; "estimated",
+        learned from how the vehicle moves (`friction`), by `lpv-nmpc` and `lpv-nmpc-tuned` alone;
+        or "linear", neither has a limit.
     max_failures
         Failed solves in a row after which the vehicle is brought to a stop.
 
@@ -106,15 +106,18 @@ class NmpcSettings:
         weights = TrackingWeights() if self.weights is None else weights_from(self.weights)
         object.__setattr__(self, "weights", weights)
 
-    def friction_in(self, task: DrivingTask) -> tuple[float, float]:
-        """Return the coefficients of friction of the tyres and the reference; inf is no limit."""
+    def friction_in(self, task: DrivingTask) -> float:
+        """Return the model's coefficient of friction for a task, or the largest estimate.
+
+        inf is no limit.
+        """
         if not isinstance(self.friction, str):
-            return self.friction, self.friction
-        if self.friction == "estimated":
-            low, high = estimated_range(task)
-            return 0.5 * (low + high), low
-        known = task.friction, task.friction_range[0]
-        return known if self.friction == "known" else (math.inf, math.inf)
+            return self.friction
+        words = {
+            "known": task.friction_range[0], "estimated": estimated_range(task)[1],
+            "linear": math.inf,
+        }  # fmt: skip
+        return words[self.friction]
 
 
 def estimated_range(task: DrivingTask) -> tuple[float, float]:
@@ -215,7 +218,6 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
             )
         self.estimated_range = estimated_range(task) if self.estimated else (math.inf, math.inf)
         stages = stages_of(settings, task.layout, task.control_period)
-        friction, least = settings.friction_in(task)
         self.problem = NmpcProblem(
             vehicle=settings.model or task.vehicle,
             horizon=len(stages),
@@ -223,9 +225,9 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
             first_period=task.control_period,
             linear_penalty=settings.linear_penalty,
             quadratic_penalty=settings.quadratic_penalty,
-            friction=friction,
+            friction=settings.friction_in(task),
         )
-        self.grip = GRIP_SHARE * least * GRAVITY
+        self.grip = GRIP_SHARE * self.problem.friction * GRAVITY
         """Largest total acceleration of the reference, m/s^2."""
         self.preview_steps = self.problem.preview_steps(task.layout.preview_period)
         self.max_failures = settings.max_failures

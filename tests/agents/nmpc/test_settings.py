@@ -180,16 +180,16 @@ def test_other_settings_are_checked() -> None:
 def test_friction_is_the_environments_a_number_or_none(name: str) -> None:
     slippery = PathTrackingEnv("T2", conditions=IDEAL.replace(friction=0.5))
     between = PathTrackingEnv("T2", conditions=IDEAL.replace(friction=(0.4, 0.8)))
-    for env, settings, tyres, least in (
-        (PathTrackingEnv("T2"), {}, math.inf, math.inf),
-        (slippery, {}, 0.5, 0.5),
-        (between, {"friction": "known"}, pytest.approx(0.6), 0.4),
-        (slippery, {"friction": "linear"}, math.inf, math.inf),
-        (slippery, {"friction": 0.9}, 0.9, 0.9),
+    for env, settings, wanted in (
+        (PathTrackingEnv("T2"), {}, math.inf),
+        (slippery, {}, 0.5),
+        (between, {"friction": "known"}, 0.4),
+        (slippery, {"friction": "linear"}, math.inf),
+        (slippery, {"friction": 0.9}, 0.9),
     ):
         agent = agents.make(name, env, **settings)
-        assert agent.problem.friction == tyres
-        assert agent.grip == pytest.approx(0.88 * least * 9.81)
+        assert agent.problem.friction == wanted
+        assert agent.grip == pytest.approx(0.88 * wanted * 9.81)
     for bad, message in (
         ("dry", r"friction 'dry'.*known, estimated, linear"),
         (0.0, r"friction must be in \[0.001, inf\]"),
