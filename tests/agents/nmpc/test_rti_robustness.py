@@ -17,7 +17,7 @@ MAX_ITERATIONS = 44
 """Turns of both methods, with a last try to end in a guess."""
 
 
-@pytest.mark.parametrize("friction", ["linear", 0.05, 0.3, 1.0])
+@pytest.mark.parametrize("friction", ["linear", "estimated", 0.05, 0.3, 1.0])
 @pytest.mark.parametrize("vehicle", PAPER_VEHICLES)
 def test_wild_observations(vehicle: str, friction: Any) -> None:
     """48,000 in all. What cannot be solved says so, and every action can be driven."""
