@@ -273,6 +273,9 @@ def test_before_a_bend_the_reference_brakes_over_the_distance_that_it_takes(grip
     np.testing.assert_allclose(found.speed[seen], reached[seen], atol=braked * PERIOD)
     began = np.flatnonzero(found.speed < speed - 1e-9)[0]
     assert found.arc_length[began] >= bend - (speed**2 - slow**2) / (2.0 * braked) - PERIOD * speed
+    # Up to there it is the preview's own.
+    whole = local_reference(row, PERIOD, FINE, leading=2.0)
+    np.testing.assert_allclose(found.arc_length[:began], whole.arc_length[:began], rtol=1e-9)
 
 
 def test_no_reference_leaves_the_friction_circle():
