@@ -57,7 +57,11 @@ class Drive:
 
     def _drive(self, agent: Any) -> Iterator[tuple[int, dict[str, Any]]]:
         self.done = yield from steps(
-            self._env, agent, seed=self.case.seed, computing_time=self.case.make_computing()
+            self._env,
+            agent,
+            seed=self.case.seed,
+            options=self.case.reset_options,
+            computing_time=self.case.make_computing(),
         )
 
     def advance(self) -> bool:

@@ -260,13 +260,13 @@ class ReferencePath:
         Raises
         ------
         ValueError
-            If it is not within the path, or has fewer than 4 nodes.
+            If it is not within the path, does not end after its start, or has fewer than 4 nodes.
         """
         start, end = (ARC_LENGTHS.of("section", value) for value in (start, end))
         if not 0.0 <= start < end <= self.length + 0.5 * self.spacing:
             raise ValueError(
-                f"path {shown(self.name)}: section {start:g} to {end:g} m is not within its "
-                f"{self.length:.6g} m"
+                f"path {shown(self.name)}: section {start:g} to {end:g} m does not go forward "
+                f"within its {self.length:.6g} m"
             )
         nodes = slice(round(start / self.spacing), round(end / self.spacing) + 1)
         return ReferencePath(

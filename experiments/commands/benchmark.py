@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shared.add_conditions(
         parser,
         None,
-        "simulation (default), realtime or ideal",
+        "simulation (default), realtime, randomised or ideal",
         "fields to change, e.g. gnss_noise=0.3 computing_delay=[0.01,0.05]",
     )
     shared.add_seeds(parser, 1, "seeds 0..N-1 (default 1)")
@@ -37,9 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shared.add_settings(
         parser, "--env", "environment settings, e.g. initial_error_range=[0.3,0.1,0.5]"
     )
-    shared.add_settings(
-        parser, "--start", "where the vehicle starts, e.g. arc_length=40 lateral_error=2 speed=0"
-    )
+    shared.add_start(parser)
     shared.add_agent_settings(parser)
     shared.add_settings(
         parser, "--vehicle-set", "vehicle fields to change, e.g. max_lateral_velocity_ratio=0.5"

@@ -19,6 +19,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shared.add_seed(parser)
     shared.add_agent_settings(parser)
     shared.add_settings(parser, "--env")
+    shared.add_start(parser)
     parser.add_argument(
         "--frames", type=shared.file_name, metavar="DIR", help="write PNG frames, open no window"
     )
@@ -60,6 +61,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
             seed=options.seed,
             agent_settings=settings[name],
             env_settings=shared.parse_settings(options.env),
+            start=shared.parse_settings(options.start),
         )
         for name in names
     ]

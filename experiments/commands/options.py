@@ -118,6 +118,13 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def add_start(parser: argparse.ArgumentParser) -> None:
+    """Declare `--start`, the reset options that say where the vehicle starts."""
+    add_settings(
+        parser, "--start", "where the vehicle starts, e.g. arc_length=40 lateral_error=2 speed=0"
+    )
+
+
 def add_seed(parser: argparse.ArgumentParser) -> None:
     """Add `--seed`, 0 by default."""
     parser.add_argument("--seed", type=whole(0, 2**63 - 1), default=0)

@@ -101,6 +101,11 @@ class BaseCase(ABC):
         ]
 
     @property
+    def reset_options(self) -> dict[str, Any]:
+        """Options of the episode's reset."""
+        return {}
+
+    @property
     @abstractmethod
     def place(self) -> str:
         """Name of the trajectory or scene."""
@@ -173,6 +178,11 @@ class Case(BaseCase):
     computing: Mapping[str, Any] = field(default_factory=dict)
     regime: str = ""
     start: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def reset_options(self) -> dict[str, Any]:
+        """Where the vehicle starts."""
+        return dict(self.start)
 
     @property
     def place(self) -> str:
@@ -273,7 +283,7 @@ class Case(BaseCase):
             agent = self.make_agent(env)
             result |= learning_cost.of_agent(agent)
             driven = rollout(
-                env, agent, seed=self.seed, options=dict(self.start), computing_time=computing
+                env, agent, seed=self.seed, options=self.reset_options, computing_time=computing
             )
             car = env.unwrapped.vehicle  # type: ignore[attr-defined]
             env.close()

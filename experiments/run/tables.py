@@ -70,6 +70,8 @@ class Setting(NamedTuple):
     control_period: float
     env_settings: str
     regime: str = ""
+    start: str = "{}"
+    """Where a vehicle starts; a regime holds cases with many starts."""
 
     @property
     def family(self) -> "Setting":
@@ -99,6 +101,8 @@ class Setting(NamedTuple):
             parts.append(f"control period {self.control_period} s")
         if changed := json.loads(self.env_settings):
             parts.append(f"env {_changes(changed)}")
+        if changed := json.loads(self.start):
+            parts.append(f"start {_changes(changed)}")
         return " · ".join(parts)
 
 
@@ -119,6 +123,7 @@ def setting_of(case: Result) -> Setting:
         control_period=case.get("control_period", Case.control_period),
         env_settings=text("env_settings", {}),
         regime=str(case.get("regime") or ""),
+        start="{}" if case.get("regime") else text("start", {}),
     )
 
 

@@ -414,6 +414,12 @@ def test_drive_writes_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert not np.array_equal(pictures[0], pictures[-1])
 
 
+def test_drive_starts_where_it_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["drive", "--agent", "stanley", "--trajectory", "straight", "--frames", "unused"]
+    assert "at -3 m/s" in refused(capsys, *command, "--start", "speed=-3")
+    assert "nearest: arc_length" in refused(capsys, *command, "--start", "arc_lenth=3")
+
+
 def test_drive_refuses_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "nearest: stanley" in refused(capsys, "drive", "--agent", "stanly")
     command = ["drive", "--agent", "stanley", "--trajectory", "u-turn"]

@@ -174,7 +174,7 @@ def test_a_section_is_the_part_of_the_path() -> None:
         np.testing.assert_array_equal(getattr(part, column), getattr(path, column)[nodes])
     assert path.section(0.0, path.length).table.shape == path.table.shape
     for start, end in ((-1.0, 50.0), (50.0, 50.0), (0.0, 600.0)):
-        with pytest.raises(ValueError, match="is not within its"):
+        with pytest.raises(ValueError, match="does not go forward within its"):
             path.section(start, end)
 
 

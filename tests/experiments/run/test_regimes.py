@@ -84,3 +84,13 @@ def test_cases_with_a_start_show_how_they_come_back() -> None:
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "overshoot" in text
     assert "4.6" in text
+
+
+def test_starts_are_settings_of_their_own_but_within_a_regime() -> None:
+    """Cases from different places are not averaged, and their tables say where they start."""
+    beside, ahead = (setting_of(case(k, start={"lateral_error": k})) for k in (1, 2))
+    assert beside != ahead
+    assert str(beside).endswith(" · start lateral_error=1")
+    together = {str(setting_of(case(k, regime=SLOW, start={"lateral_error": k}))) for k in (1, 2)}
+    assert len(together) == 1
+    assert "start" not in together.pop()
