@@ -59,7 +59,7 @@ WARM_OPTIONS: dict[str, Any] = {
     "mu_init": 1e-3,
     "mu_strategy": "adaptive",  # 5 iterations a solve where the monotone strategy takes 13
 }
-FATROP_ITERATIONS = 300
+FATROP_ITERATIONS = 500
 ASIDE = 0.01
 """Steering angle added to a cold start's, rad."""
 TOLERANCE = Number(0.0, 1.0, above=True)

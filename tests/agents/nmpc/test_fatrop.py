@@ -152,6 +152,5 @@ def test_from_rest_on_a_straight_it_drives_off(solver: str) -> None:
         action, memory = agent.predict(observation, memory, np.array([step == 0]))
         shown = agent.diagnostics(memory[0])
         assert shown["status"] == "SUCCESS"
-        assert shown["iterations"] < 250
         assert shown["plan"][-1, 0] > 2.0
         observation, *_ = env.step(action)
