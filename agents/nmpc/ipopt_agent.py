@@ -120,7 +120,7 @@ class IpoptNmpc(SolvedNmpc):
     tolerance, max_seconds
         Tolerance of the solver, and IPOPT's time limit of a solve, s. The default is far above any
         solve, which 100 iterations bound, so that results do not depend on the machine's load;
-        lower it to drive in real time. fatrop has no time limit, but at most 300 iterations.
+        lower it to drive in real time. fatrop has no time limit, but at most 500 iterations.
     settings
         Keyword arguments of `NmpcSettings`, one by one.
 
