@@ -94,8 +94,8 @@ LIMITS: dict[str, list[dict[str, Any]]] = {
 }  # fmt: skip
 """Regimes of the suite `limits`: arguments of `grid`, whose seeds are the fewest that are driven.
 
-Friction 0.79 at 0.75 g of lateral acceleration is 95 % of the grip. At 0.55 g, a draw of the
-friction below 0.55 cannot be held by anybody.
+Friction 0.79 at 0.75 g of lateral acceleration is 95 % of the grip. At 0.55 g, a path cannot be
+held at its planned speed where the friction drawn is below 0.55.
 """
 STANDING = tuple(
     (name, arc_length)
