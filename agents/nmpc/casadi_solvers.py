@@ -40,6 +40,7 @@ IPOPT_STATUS = {
     "Restoration_Failed": Status.INFEASIBLE,
     "Invalid_Number_Detected": Status.NAN,
 }
+SHARED_OPTIONS: dict[str, Any] = {"expand": True, "print_time": False, "error_on_fail": False}
 COLD_OPTIONS: dict[str, Any] = {
     "print_level": 0,
     "sb": "yes",
@@ -331,7 +332,7 @@ class IpoptSolver(_NlpSolver):
             "lbg": np.array(nlp.lower_rows, dtype=np.float64),
             "ubg": np.array(nlp.upper_rows, dtype=np.float64),
         }
-        shared: dict[str, Any] = {"expand": True, "print_time": False, "error_on_fail": False}
+        shared = dict(SHARED_OPTIONS)
         limits = {"tol": tolerance, "max_wall_time": max_seconds}
         cold = {**shared, "ipopt": {**COLD_OPTIONS, **limits}}
         self._cold_solver = ca.nlpsol("nmpc", "ipopt", given, cold)
@@ -438,16 +439,10 @@ class FatropSolver(_NlpSolver):
         nlp = self._transcribed()
         states, controls, rows = (list(sizes) for sizes in zip(*nlp.sizes, strict=True))
         options: dict[str, Any] = {
-            "structure_detection": "manual",
-            "N": problem.horizon,
-            "nx": states,
-            "nu": controls,
-            "ng": rows,
-            "expand": True,
-            "print_time": False,
-            "error_on_fail": False,
+            **SHARED_OPTIONS, "structure_detection": "manual", "N": problem.horizon, "nx": states,
+            "nu": controls, "ng": rows,
             "fatrop": {"print_level": 0, "tolerance": tolerance, "max_iter": FATROP_ITERATIONS},
-        }
+        }  # fmt: skip
         self._bounds = {
             "lbx": _tightened(nlp.lower, 1.0),
             "ubx": _tightened(nlp.upper, -1.0),
