@@ -12,6 +12,7 @@ import numpy as np
 import agents
 from agents.weight_tuning.closed_loop import ClosedLoop
 from agents.weight_tuning.env import WeightTuningVectorEnv
+from agents.weights import WEIGHTS
 from experiments.speed import environments
 from experiments.speed.measure import (
     Effort,
@@ -109,7 +110,7 @@ class Driving:
 
     def __init__(self, loop: ClosedLoop) -> None:
         n = loop.envs.num_envs
-        spread = np.random.default_rng(0).normal(0.0, SPREAD, (n, 10))
+        spread = np.random.default_rng(0).normal(0.0, SPREAD, (n, WEIGHTS))
         self.loop, self.weights = loop, loop.agent.fixed_weights * np.exp(spread)
         self.periods = 1.0
         """Control periods driven per call in the last round, summed over the environments."""

@@ -36,7 +36,7 @@ from experiments.speed.measure import (
     interleave,
 )
 
-MEASURED = ["single", "vector", "solvers", "batches", "tuning", "rendering"]
+MEASURED = ["single", "vector", "solvers", "batches", "loops", "tuning", "rendering"]
 
 
 def quietly(text: str) -> None:
