@@ -20,7 +20,7 @@ MAX_ITERATIONS = 44
 @pytest.mark.parametrize("friction", ["linear", "estimated", 0.05, 0.3, 1.0])
 @pytest.mark.parametrize("vehicle", PAPER_VEHICLES)
 def test_wild_observations(vehicle: str, friction: Any) -> None:
-    """48,000 in all. What cannot be solved says so, and every action can be driven."""
+    """60,000 in all. What cannot be solved says so, and every action can be driven."""
     env = environment(vehicle=vehicle)
     agent, rng, n = made(env, friction=friction), np.random.default_rng(5), 1500
     statuses: Counter[str] = Counter()
