@@ -39,8 +39,8 @@ def exceeds(
 
 
 @compiled_internal
-def left_by(turning: Any, grip: Any) -> Any:
-    """Return what a lateral acceleration leaves of the friction circle, m/s^2."""
+def remaining_grip(turning: Any, grip: Any) -> Any:
+    """Return the acceleration that a lateral one leaves within the friction circle, m/s^2."""
     return math.sqrt(max(grip * grip - turning * turning, 0.0))
 
 
@@ -53,11 +53,12 @@ def cap_speeds(
 
     Returns False, with nothing filled, if the preview is slow enough.
 
-    No node is passed faster than in the preview, and on no interval is the total acceleration
-    larger than `grip` (m/s^2): bends are taken more slowly, and what they leave of the friction
-    circle brakes before and accelerates behind them. It does so as the preview does, or, where that
-    is more, with `SHARE` of `rate`, and of `braking`, but `BRAKING_SHARE` of the grip (m/s^2). Only
-    a vehicle that is too fast already, at `pace` (m/s), is braked by no more than the latter.
+    No node is passed faster than in the preview, and no total acceleration exceeds `grip` (m/s^2):
+    bends are taken more slowly, and the rest of the friction circle serves to brake before them and
+    to accelerate behind them. The largest deceleration is the preview's own or, if that is larger,
+    `SHARE` of `braking`, at most `BRAKING_SHARE` of the grip; the largest acceleration is the
+    preview's own or `SHARE` of `rate` (m/s^2). If the vehicle is already too fast, at `pace` (m/s),
+    the speeds begin there and fall with the deceleration of `braking` and grip.
     """
     steps, squared, bend, after = capped.shape[0] - 1, math.inf, 0.0, 0.0
     if not exceeds(curvature, first_speed, speed, period, steps, grip):
@@ -69,7 +70,7 @@ def cap_speeds(
         if k > 0:
             before, curve = float(speed[k - 1]), abs(float(curvature[k - 1]))
         if k < steps:
-            lost = min(max(before - after, slowed), period * left_by(squared * bend, grip))
+            lost = min(max(before - after, slowed), period * remaining_grip(squared * bend, grip))
             squared += lost * (before + after)
         squared = min(squared, before * before)
         if squared * max(bend, curve) > grip:
@@ -80,7 +81,7 @@ def cap_speeds(
         capped[k] = min(max(capped[k], least), before * before)
         if k < steps:
             after = float(speed[k])
-            left = period * left_by(capped[k] * abs(float(curvature[k])), grip)
+            left = period * remaining_grip(capped[k] * abs(float(curvature[k])), grip)
             gained = min(max(after - before, SHARE * rate * period), left)
             capped[k + 1] = min(capped[k + 1], capped[k] + gained * (before + after))
             least -= slowed * (before + after)

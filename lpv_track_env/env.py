@@ -123,7 +123,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     conditions
         "simulation" (perfect actuators, sensors, knowledge of the vehicle), "realtime" (our model
         of a vehicle's runs), a `lpv_track_env.conditions.Conditions`, or a dictionary of its
-        fields, e.g. `{"name": "realtime", "estimator": "raw"}`.
+        fields, e.g. `{"name": "realtime", "estimator": "raw"}`; ranges are drawn every episode.
     control_period
         s; the dynamics are integrated with fixed Runge-Kutta steps of at most 5 ms within it.
     preview_steps, preview_period
@@ -135,8 +135,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     time_limit
         s; by default one and a half times the path's duration plus 10 s.
     plant
-        Model of the driven vehicle: "bicycle", a model by others (`lpv_track_env.plants`), or a
-        function of `VehicleParameters` that returns a `Plant`.
+        Model of the driven vehicle: "bicycle", one of `lpv_track_env.plants` ("single-track",
+        "drift", "multi-body"), or a function of `VehicleParameters` that returns a `Plant`.
     render_colour
         Colour of the path in frames: by "speed", the reference's, or by "curvature".
 

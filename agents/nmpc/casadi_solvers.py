@@ -258,7 +258,7 @@ class _NlpSolver(ABC):
     def _cold_guess(self, state: Array, last_input: Array, reference: Array) -> Array:
         """Guess without a plan: the model driven towards the reference's speed, wheels held.
 
-        They are held `ASIDE`: where a car that drives off straight could gain by either turn, the
+        They are turned by `ASIDE`: where a car that drives off straight could gain by either turn, the
         symmetric plan is stationary without being a minimum, and solvers end there.
         """
         problem, car = self.problem, self.problem.vehicle

@@ -5,12 +5,12 @@ control period ahead from the last observation. What a candidate misses counts a
 
     L_i <- L_i + s (-n/2 e_i - L_i),  e_i = (vy miss / sigma_vy)^2 + (r miss / sigma_r)^2
 
-The posterior is exp(L_i), from a uniform distribution on the candidates. L_i is a forgetting mean,
-with the memory T / s of T = `MEMORY`. Errors of the model (mass, stiffness, wind, delays, a filter
-that knows another friction) last longer than a period, so all of its observations count as
-n = `INDEPENDENT` ones, and sigma is the model's error, not the sensors' noise. The share s, from 0
-to 1, is how far the candidates' predictions are apart: only slip tells friction, and without it the
-estimate stays.
+The prior is uniform on the candidates and the posterior proportional to exp(L_i). L_i is a
+forgetting mean over the time T / s, T = `MEMORY`. Errors of the model (mass, stiffness, wind,
+delays, a filter that knows another friction) last longer than a period, so all of its observations
+count as n = `INDEPENDENT` ones, and sigma is the model's error, not the sensors' noise. The share
+s, from 0 to 1, is how far the candidates' predictions are apart: only slip tells friction, and
+without it the estimate stays.
 """
 
 import math

@@ -23,8 +23,8 @@ the same for stages of any length and number. The paper's cost is that of stages
 R_rate, which it has not.
 
 Every solver takes the weights as they are given; the agents schedule one of them over the measured
-speed (`NmpcProblem.weights_at`): to the weight on the steering rate comes one on lateral jerk, so
-that weights which are brisk at 5 m/s do not make a fast car with stiff tyres weave.
+speed (`NmpcProblem.weights_at`). They add a weight on lateral jerk to that on the steering rate, so
+that weights for brisk steering at 5 m/s do not make a fast car with stiff tyres weave.
 
 A soft constraint may be violated by a slack s >= 0 at a cost of linear s + 1/2 quadratic s^2. This
 penalty is exact for multipliers below `linear`, so slack is used only where the path demands the

@@ -44,7 +44,7 @@ from trajectories.compilation import (
 Array = NDArray[Any]
 Float = Any
 
-factor_at = compiled_internal(steering_rate_factor)
+compiled_steering_rate_factor = compiled_internal(steering_rate_factor)
 
 SHORTENINGS = 3
 """Halvings of a step that the line search tries at most."""
@@ -277,7 +277,8 @@ def schedule_weights(weights: Array, vx: Float, p: Array, scheduled: Array) -> N
         scheduled[k] = weights[k]
     wheelbase = p[2] + p[3]
     understeer = p[0] * (p[3] * p[5] - p[2] * p[4]) / (wheelbase * p[4] * p[5])
-    scheduled[WEIGHTS - 1] *= factor_at(min(abs(vx), p[L.HIGH_SPEED]), wheelbase, understeer)
+    vx = min(abs(vx), p[L.HIGH_SPEED])
+    scheduled[WEIGHTS - 1] *= compiled_steering_rate_factor(vx, wheelbase, understeer)
 
 
 @compiled

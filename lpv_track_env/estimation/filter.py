@@ -124,7 +124,7 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
         s[LOWEST_SPEED],
     )  # fmt: skip
     # The Jacobian needs fewer steps, enough to resolve the lateral poles; their sum bounds each.
-    # Limited tyres slow them.
+    # The poles of limited tyres are slower.
     q = compiled_inverse_speed(vx)
     poles = q * ((p4 + p5) / p0 + (p4 * p2 * p2 + p5 * p3 * p3) / p1)
     few = min(max(math.ceil(poles * dt / JACOBIAN_STEP), 1), substeps)
