@@ -8,16 +8,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from agents.base import DrivingTask, TrackingAgent
-from agents.reference import (
-    LocalReference,
-    Turn,
-    early_turn,
-    lagged_sideslip,
-    local_reference,
-    mean_curvature,
-    steady_turn,
-    transient_turn,
-)
+from agents.reference import LocalReference, local_reference, mean_curvature
+from agents.steady_turn import Turn, early_turn, lagged_sideslip, steady_turn, transient_turn
 from lpv_track_env import bicycle
 from lpv_track_env.observation import TrackingObservation
 from trajectories.arguments import Number
@@ -142,8 +134,8 @@ class ClassicalAgent(TrackingAgent[SpeedM]):
 class NominalMotionAgent(ClassicalAgent[MotionM]):
     """Agent that steers along the nominal motion and corrects the errors from it.
 
-    The nominal motion keeps the centre of gravity on the path (`agents.reference.transient_turn`);
-    a corner too sharp for any vehicle is begun early (`early_turn`).
+    The nominal motion keeps the centre of gravity on the path (`steady_turn.transient_turn`); a
+    corner too sharp for any vehicle is begun early (`early_turn`).
 
     Parameters
     ----------

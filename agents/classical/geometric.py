@@ -20,7 +20,8 @@ from agents.classical.base import (
     NominalMotionAgent,
     SpeedMemory,
 )
-from agents.reference import LocalReference, mean_curvature, point_at, steady_turn
+from agents.reference import LocalReference, mean_curvature, point_at
+from agents.steady_turn import steady_turn
 from lpv_track_env.observation import TrackingObservation
 from trajectories.arguments import Number, checks_arguments
 

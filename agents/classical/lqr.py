@@ -9,7 +9,8 @@ from scipy.linalg import expm, solve_discrete_are
 
 from agents.base import DrivingTask
 from agents.classical.base import ANGLE, WINDOW, ClassicalAgent, SpeedMemory
-from agents.reference import LocalReference, mean_curvature, steady_turn
+from agents.reference import LocalReference, mean_curvature
+from agents.steady_turn import steady_turn
 from lpv_track_env import lpv
 from lpv_track_env.bicycle import VY, YAW_RATE
 from lpv_track_env.observation import TrackingObservation
@@ -110,7 +111,7 @@ class LpvLqr(ClassicalAgent[SpeedMemory]):
     rate and the gains hardly depend on T. On a circle all three terms vanish: the steering angle,
     sideslip and heading error of a steady turn cost nothing, so a constant curvature leaves no
     error. The model is linear in the steering angle; its difference from the bicycle's steady turn
-    (`agents.reference.steady_turn`) is subtracted from the state. Gains are interpolated between
+    (`agents.steady_turn`) is subtracted from the state. Gains are interpolated between
     speeds. The grid omits standstill, where lateral errors cannot be controlled.
 
     Parameters

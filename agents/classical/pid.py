@@ -41,7 +41,7 @@ class Pid(NominalMotionAgent[PidMemory]):
 
     e is the lateral error at a point l ahead of the centre of gravity; it is zero for a vehicle on
     the path, in curves as well. delta_n and beta_n are the steering and sideslip that keep the
-    centre of gravity on the path (`agents.reference.transient_turn`). (L + K vx^2) is the steering
+    centre of gravity on the path (`steady_turn.transient_turn`). (L + K vx^2) is the steering
     angle per curvature, so over the distance driven e_y'' + (2 zeta/l)^2 (e_y + l e_y') = 0, which
     is critically damped for zeta = 1 at every speed and for every vehicle. The integral is held
     while the steering is at a range or rate limit and the error would drive it further.

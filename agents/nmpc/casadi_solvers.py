@@ -1,8 +1,8 @@
-"""Exact solvers of the NMPC's problem with CasADi: IPOPT, the paper's way, and fatrop.
+"""Exact solvers of the NMPC's problem with CasADi, and IPOPT, the paper's way.
 
-Both solve the problem by multiple shooting. The NLP is built once; weights, reference, state and
-last input are its parameters. Each solver orders the problem's stages in its own way, so that the
-two check one another.
+The problem is solved by multiple shooting. The NLP is built once; weights, reference, state and
+last input are its parameters. `fatrop` has the other solver: each orders the problem's stages in
+its own way, so that the two check one another.
 """
 
 import time
@@ -60,12 +60,9 @@ WARM_OPTIONS: dict[str, Any] = {
     "mu_init": 1e-3,
     "mu_strategy": "adaptive",  # 5 iterations a solve where the monotone strategy takes 13
 }
-FATROP_ITERATIONS = 500
 ASIDE = 0.01
 """Steering angle added to a cold start's, rad."""
 TOLERANCE = Number(0.0, 1.0, above=True)
-RELAXATION = 1e-8
-"""fatrop relaxes every bound b by RELAXATION max(1, |b|), which none of its options turns off."""
 
 
 def lpv_field(state: Any, action: Any, problem: NmpcProblem) -> Any:
@@ -96,7 +93,7 @@ def stage_models(problem: NmpcProblem) -> list[ca.Function]:
     return [models[length] for length in lengths]
 
 
-class _Nlp:
+class Nlp:
     """Parameters, variables, constraints and cost of an NLP while it is built, stage by stage."""
 
     def __init__(self, problem: NmpcProblem) -> None:
@@ -193,7 +190,7 @@ class _Nlp:
         }
 
 
-class _NlpSolver(ABC):
+class NlpSolver(ABC):
     """A solver of the problem as an NLP, whose variables are N groups of `GROUP`."""
 
     GROUP: ClassVar[int]
@@ -258,8 +255,8 @@ class _NlpSolver(ABC):
     def _cold_guess(self, state: Array, last_input: Array, reference: Array) -> Array:
         """Guess without a plan: the model driven towards the reference's speed, wheels held.
 
-        They are turned by `ASIDE`: where a car that drives off straight could gain by either turn, the
-        symmetric plan is stationary without being a minimum, and solvers end there.
+        They are turned by `ASIDE`: where a car that drives off straight could gain by either turn,
+        the symmetric plan is stationary without being a minimum, and solvers end there.
         """
         problem, car = self.problem, self.problem.vehicle
         low, high = problem.input_bounds
@@ -298,7 +295,7 @@ class _NlpSolver(ABC):
             row[self.STATE] = state = np.asarray(model(state, row[self.INPUT[0]])).ravel()
 
 
-class IpoptSolver(_NlpSolver):
+class IpoptSolver(NlpSolver):
     """IPOPT on the NMPC's problem: the reference for correctness.
 
     The variables of a group are u_i (2), slack_i (3) and x_{i+1} (6).
@@ -344,9 +341,9 @@ class IpoptSolver(_NlpSolver):
         warm = {**shared, "ipopt": {**WARM_OPTIONS, **limits}}
         self._warm_solver = ca.nlpsol("nmpc", "ipopt", given, warm)
 
-    def _transcribed(self) -> _Nlp:
+    def _transcribed(self) -> Nlp:
         problem = self.problem
-        nlp = _Nlp(problem)
+        nlp = Nlp(problem)
         low_u, high_u = problem.input_bounds
         linear, quadratic = ca.DM(problem.linear_penalty), ca.DM(problem.quadratic_penalty)
         nlp.begin(0)
@@ -389,112 +386,3 @@ class IpoptSolver(_NlpSolver):
 
     def _status(self, statistics: dict[str, Any]) -> Status:
         return IPOPT_STATUS.get(statistics["return_status"], Status.QP_FAILURE)
-
-
-class FatropSolver(_NlpSolver):
-    """fatrop on the NMPC's problem: a second exact solver, to check IPOPT.
-
-    fatrop (Vanroye, Sathya, De Schutter, Decre, IROS 2023) is an interior-point method whose linear
-    algebra is a Riccati recursion, so neighbouring stages may be coupled by the dynamics alone. The
-    bound on the input's change couples u_i with u_{i-1}: the last input joins the state::
-
-        stage 0     controls u_0, s_0                 (x_0 and the input in force are parameters)
-        stage i     states x_i, u_{i-1}               controls sigma_i, u_i, s_i       0 < i < N
-        stage N     states x_N, u_{N-1}               controls sigma_N
-
-    s_i is the slack on vx'(x_i, u_i), sigma_i (2) that on vx_i and vy_i: each belongs to the stage
-    whose variables it relaxes. The variables are N groups (u_i, s_i, x_{i+1}, u_i, sigma_{i+1}).
-
-    fatrop has no time limit; `FATROP_ITERATIONS` bounds a solve. With a tolerance below 1e-6 it
-    regularises Hessians near some optima and then gives up (QP_FAILURE from its line search, or
-    MAXITER; one in ten at 1e-8), although IPOPT agrees with its plan.
-
-    Parameters
-    ----------
-    problem
-        The problem.
-    tolerance
-        fatrop's tolerance on the scaled optimality conditions.
-
-    Raises
-    ------
-    ValueError
-        If the installed CasADi was built without fatrop.
-    """
-
-    GROUP = INPUTS + SOFT + STATES + INPUTS
-    STATE = slice(INPUTS + 1, INPUTS + 1 + STATES)
-    SLACK: ClassVar[list[int]] = [GROUP - 2, GROUP - 1, INPUTS]
-    INPUT = (slice(0, INPUTS), slice(STATE.stop, STATE.stop + INPUTS))
-    WARM: ClassVar[dict[str, str]] = {"x0": "x"}
-
-    @checks_arguments(tolerance=TOLERANCE)
-    def __init__(self, problem: NmpcProblem, *, tolerance: float = 1e-6) -> None:
-        if not ca.has_nlpsol("fatrop"):
-            raise ValueError(
-                "this CasADi was built without fatrop: say solver='ipopt', or install its wheel "
-                "from PyPI"
-            )
-        self.problem, self._models = problem, stage_models(problem)
-        nlp = self._transcribed()
-        states, controls, rows = (list(sizes) for sizes in zip(*nlp.sizes, strict=True))
-        options: dict[str, Any] = {
-            **SHARED_OPTIONS, "structure_detection": "manual", "N": problem.horizon, "nx": states,
-            "nu": controls, "ng": rows,
-            "fatrop": {"print_level": 0, "tolerance": tolerance, "max_iter": FATROP_ITERATIONS},
-        }  # fmt: skip
-        self._bounds = {
-            "lbx": _tightened(nlp.lower, 1.0),
-            "ubx": _tightened(nlp.upper, -1.0),
-            "lbg": _tightened(nlp.lower_rows, 1.0, equal=nlp.equal),
-            "ubg": _tightened(nlp.upper_rows, -1.0, equal=nlp.equal),
-        }
-        self._cold_solver = ca.nlpsol("nmpc", "fatrop", nlp.as_dict(), options)
-        self._warm_solver = self._cold_solver
-
-    def _transcribed(self) -> _Nlp:
-        problem, n = self.problem, self.problem.horizon
-        nlp = _Nlp(problem)
-        low_u, high_u = problem.input_bounds
-
-        def penalty(slack: Any, entry: int) -> Any:
-            linear, quadratic = problem.linear_penalty[entry], problem.quadratic_penalty[entry]
-            return linear * slack + 0.5 * quadratic * slack**2
-
-        x, applied = nlp.initial, nlp.last
-        for i in range(n + 1):
-            nlp.begin(0 if i == 0 else STATES + INPUTS)
-            here = x
-            squared = nlp.error(i, here) ** 2
-            nlp.cost += 0.5 * ca.dot(nlp.shares[i] * nlp.q if i < n else nlp.s, squared)
-            if i > 0:
-                sigma = nlp.control(f"sigma{i}", 2, 0.0, INFINITY)
-                nlp.cost += nlp.shares[i - 1] * (penalty(sigma[0], 0) + penalty(sigma[1], 1))
-            if i < n:
-                u = nlp.control(f"u{i}", INPUTS, low_u, high_u)
-                rate_slack = nlp.control(f"s{i}", 1, 0.0, INFINITY)
-                nlp.cost += nlp.shares[i] * penalty(rate_slack, 2)
-                nlp.add_input_cost(i, u, applied)
-                following = nlp.state(f"x{i + 1}", STATES + INPUTS)
-                # fatrop needs the gap as x_{i+1} - F, and before the stage's other rows.
-                nlp.gap(following - ca.vertcat(self._models[i](here, u), u))
-                nlp.limit(u - applied, -problem.input_steps[i], problem.input_steps[i])
-                nlp.limit_rate(here, u, rate_slack)
-                x, applied = following[:STATES], following[STATES:]
-            if i > 0:
-                nlp.limit_velocity(here, sigma)
-        return nlp
-
-    def _status(self, statistics: dict[str, Any]) -> Status:
-        if statistics["success"]:
-            return Status.SUCCESS
-        exhausted = int(statistics["iter_count"]) >= FATROP_ITERATIONS
-        return Status.MAXITER if exhausted else Status.QP_FAILURE
-
-
-def _tightened(bounds: list[float], sign: float, equal: list[bool] | None = None) -> Array:
-    """Tighten bounds by what fatrop will relax them; equalities stay."""
-    values = np.array(bounds, dtype=np.float64)
-    moved = np.isfinite(values) & ~np.array(equal or [False] * len(bounds), dtype=np.bool_)
-    values[moved] += sign * RELAXATION * np.maximum(1.0, np.abs(values[moved]))
-    return values

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from agents.base import DrivingTask
 from agents.nmpc.base import Fallback, NmpcAgent, NmpcSettings
-from agents.nmpc.casadi_solvers import FatropSolver, IpoptSolver
+from agents.nmpc.casadi_solvers import IpoptSolver
+from agents.nmpc.fatrop import FatropSolver
 from agents.nmpc.problem import Solution, Status
 from agents.nmpc.schedule import NO_BAND
 from agents.weights import WEIGHTS

@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import DrivingTask
-from agents.nmpc.casadi_solvers import FatropSolver, IpoptSolver
+from agents.nmpc.casadi_solvers import IpoptSolver
+from agents.nmpc.fatrop import FatropSolver
 from agents.nmpc.ipopt_agent import IpoptNmpc
 from agents.nmpc.linearisation import Linearisation
 from agents.nmpc.problem import Solution, Status
 from agents.nmpc.rti_solver import RtiSolver
-from agents.reference import steady_turn
 from agents.registry import agent_class
+from agents.steady_turn import steady_turn
 from agents.weights import TrackingWeights
 from experiments.run.suites import PAPER_VEHICLES, SIX
 from experiments.verify.oracles import (

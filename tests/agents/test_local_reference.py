@@ -11,17 +11,14 @@ from agents.reference import (
     LEAD,
     NEAR_PATH,
     NODE,
-    early_turn,
     fill_nodes,
     fill_nodes_at,
-    lagged_sideslip,
     local_reference,
     mean_curvature,
     point_at,
-    steady_turn,
-    transient_turn,
 )
 from agents.speed_cap import SHARE
+from agents.steady_turn import early_turn, lagged_sideslip, steady_turn, transient_turn
 from lpv_track_env import bicycle
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
 from lpv_track_env.vehicle import VEHICLES

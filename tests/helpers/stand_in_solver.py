@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.nmpc.casadi_solvers import FatropSolver
+from agents.nmpc.fatrop import FatropSolver
 from agents.nmpc.problem import NOMINAL_PERIOD, NmpcProblem, Solution, Status
 from experiments.verify.oracles import turns
 from lpv_track_env.bicycle import derivative

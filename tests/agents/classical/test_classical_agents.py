@@ -16,7 +16,7 @@ import trajectories
 from agents.base import DrivingTask
 from agents.classical.geometric import PurePursuit, Stanley
 from agents.classical.lqr import LpvLqr, lateral_model
-from agents.reference import steady_turn
+from agents.steady_turn import steady_turn
 from lpv_track_env import bicycle
 from lpv_track_env.vehicle import VEHICLES
 

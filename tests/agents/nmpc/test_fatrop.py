@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 import agents
-from agents.nmpc.casadi_solvers import FatropSolver, IpoptSolver
+from agents.nmpc.casadi_solvers import IpoptSolver
+from agents.nmpc.fatrop import FatropSolver
 from agents.nmpc.problem import NmpcProblem, Status
 from agents.weights import TrackingWeights
 from lpv_track_env.vehicle import COURSE_CAR, M2_MINIBUS, VehicleParameters
