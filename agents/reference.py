@@ -153,7 +153,7 @@ def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, no
 @compiled_internal
 def fill_nodes_at(
     curvature: Array, first_speed: Any, speed: Array, period: Any, lengths: Array, pace: Any,
-    rate: Any, grip: Any, braking: Any, capped: Array, nodes: Array,
+    rate: Any, grip: Any, braking: Any, offset: Any, decay: Any, capped: Array, nodes: Array,
 ) -> None:  # fmt: skip
     """Fill nodes (n + 1, NODE) that are `lengths` (n,) s apart, from the intervals of one preview.
 
@@ -162,7 +162,9 @@ def fill_nodes_at(
 
     The nodes are no faster than pace + LEAD + SHARE `rate` t (m/s, m/s^2), and none of the first
     intervals, as many as `capped` has entries for beside the first, is passed faster than
-    `cap_speeds` says: where the reference is, they pass its places more slowly.
+    `cap_speeds` says: where the reference is, they pass its places more slowly. So they do where a
+    vehicle that approaches the path, from `offset` m beside it within the length `decay` (m), has
+    the longer way: outside of a bend, and across.
     """
     limited = grip < math.inf and cap_speeds(
         curvature, first_speed, speed, period, pace, rate, grip, braking, capped
@@ -183,6 +185,10 @@ def fill_nodes_at(
             # The share of the reference's own time.
             rest *= (fastest + 0.5 * gain) / v
         fastest += gain
+        if offset != 0.0:
+            beside = offset * math.exp(-s / decay)
+            along = 1.0 - float(curvature[min(at, last)]) * beside
+            rest /= max(math.hypot(along, beside / decay), 1.0)
         while rest > 1e-9:
             interval = min(at, last)
             step, after = left, end
@@ -218,33 +224,36 @@ def fill_leading_nodes(
     reference it would cut the bend between. One far beside the path is led back by `approach`.
     """
     pace = vx * math.cos(heading_error)
+    offset, decay = approach(lateral_error, vx)
     fill_nodes_at(
-        curvature, first_speed, speed, period, lengths, pace, rate, grip, braking, capped, nodes
-    )
-    approach(nodes, lateral_error, vx)
+        curvature, first_speed, speed, period, lengths, pace, rate, grip, braking, offset, decay,
+        capped, nodes,
+    )  # fmt: skip
+    if offset == 0.0:
+        return
+    for k in range(nodes.shape[0]):
+        beside = offset * math.exp(-nodes[k, NODE_ARC_LENGTH] / decay)
+        heading = nodes[k, NODE_HEADING]
+        nodes[k, NODE_X] -= beside * math.sin(heading)
+        nodes[k, NODE_Y] += beside * math.cos(heading)
+        nodes[k, NODE_HEADING] = heading - math.atan(beside / decay)
 
 
 @compiled_internal
-def approach(nodes: Array, lateral_error: Any, speed: Any) -> None:
-    """Let the nodes (n + 1, NODE) lead a vehicle far beside the path back to it, in place.
+def approach(lateral_error: Any, speed: Any) -> tuple[Any, Any]:
+    """Return the offset (m) from which nodes lead a vehicle far beside the path back, and a length.
 
-    An offset that decays along the path is added, with the heading that goes with it: a reference
-    trajectory in the sense of Richalet (Automatica 29, 1993). It begins with the part of the
-    lateral error (m) beyond `NEAR_PATH` and decays as exp(-s / d). The length d bounds the angle of
-    approach, and grows with the speed (m/s). Without it a quadratic cost asks for an overshoot: it
-    is cheaper to be on the other side later than on this side now.
+    An offset that decays along the path is added to the nodes, with the heading that goes with it:
+    a reference trajectory in the sense of Richalet (Automatica 29, 1993). It begins with the part
+    of the lateral error (m) beyond `NEAR_PATH` and decays as exp(-s / d). The length d (m) bounds
+    the angle of approach, and grows with the speed (m/s). Without it a quadratic cost asks for an
+    overshoot: it is cheaper to be on the other side later than on this side now.
     """
     excess = abs(lateral_error) - NEAR_PATH
     if not excess > 0.0:
-        return
+        return 0.0, SHORTEST_APPROACH
     length = max(excess / APPROACH_SLOPE, APPROACH_TIME * abs(speed), SHORTEST_APPROACH)
-    start = math.copysign(excess, lateral_error)
-    for k in range(nodes.shape[0]):
-        offset = start * math.exp(-nodes[k, NODE_ARC_LENGTH] / length)
-        heading = nodes[k, NODE_HEADING]
-        nodes[k, NODE_X] -= offset * math.sin(heading)
-        nodes[k, NODE_Y] += offset * math.cos(heading)
-        nodes[k, NODE_HEADING] = heading - math.atan(offset / length)
+    return math.copysign(excess, lateral_error), length
 
 
 @compiled
@@ -254,7 +263,7 @@ def _fill_rows(
     for row in range(nodes.shape[0]):
         fill_nodes_at(
             curvature[row], first_speed[row], speed[row], period, lengths, math.inf, 0.0, math.inf,
-            math.inf, speed[row], nodes[row],
+            math.inf, 0.0, 1.0, speed[row], nodes[row],
         )  # fmt: skip
 
 

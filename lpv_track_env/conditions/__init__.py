@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lpv_track_env.estimation.estimator import EstimatorSettings
 from lpv_track_env.tyres import FRICTION
-from trajectories.arguments import Number, check_fields, flag, instance_of, shown
+from trajectories.arguments import Number, check_fields, flag, instance_of, numbers, shown
 from trajectories.naming import choose
 
 Array = NDArray[np.float64]
@@ -107,6 +107,10 @@ class Conditions:
         Time without a usable fix, s, after which the vehicle brakes to a stop until there is one.
     max_command_age
         Time without a new command, s, after which it brakes, too; by default three control periods.
+    slippery_stretch, slippery_factor
+        Arc lengths (start, end), m, between which the friction is the drawn one times this factor:
+        a wet or icy place, of which neither agents nor filter know. It has no effect where tyres
+        are linear: with friction inf, except on `drift` and `multi-body`.
 
     Friction limits what the tyres' side forces and the drive or brakes can do together, with the
     load that braking shifts between the axles: the model of `lpv_track_env.tyres`.
@@ -163,6 +167,8 @@ class Conditions:
     calibrate_steering: bool = True
     max_fix_age: float = 2.0
     max_command_age: float | None = None
+    slippery_stretch: tuple[float, float] = (0.0, 0.0)
+    slippery_factor: float = 1.0
 
     def __post_init__(self) -> None:
         instance_of("conditions: name", self.name, str, "a text")
@@ -176,7 +182,9 @@ class Conditions:
             object.__setattr__(self, name, _checked(name, getattr(self, name)))
         calibrate = flag("conditions: calibrate_steering", self.calibrate_steering)
         object.__setattr__(self, "calibrate_steering", calibrate)
-        ages = {"max_fix_age": AGE}
+        stretch = numbers("conditions: slippery_stretch", self.slippery_stretch, STRETCH, 2)
+        object.__setattr__(self, "slippery_stretch", stretch)
+        ages = {"max_fix_age": AGE, "slippery_factor": FRICTION_FACTOR}
         if self.max_command_age is not None:
             ages["max_command_age"] = AGE
         check_fields(self, {"gnss_period": GNSS_PERIOD, **ages}, prefix="conditions: ")
@@ -252,6 +260,8 @@ DRAWN = tuple(item.name for item in dataclasses.fields(Conditions) if item.type 
 
 GNSS_PERIOD, AGE = Number(0.001, 1e6, "s"), Number(0.0, math.inf, "s", above=True)
 """Rules of the time between fixes, and of the ages after which the vehicle brakes."""
+STRETCH, FRICTION_FACTOR = Number(0.0, 1e9, "m"), Number(0.001, 1000.0)
+"""Rules of the ends of a slippery stretch, and of the factor of friction there."""
 DELAYS = ("gnss_latency", "steering_dead_time", "drive_dead_time", "computing_delay")
 """Fields that are at most `LONGEST_DELAY`."""
 LONGEST_DELAY = 2.0

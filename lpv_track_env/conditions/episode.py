@@ -98,7 +98,10 @@ def drive_under_conditions(
         m, key, episode, sensors.PERIOD_DRAW + sensors.DRAWS * (int(record[k.STEPS]) + 1), period
     )
     commands = m[layout.TAIL : layout.fixes_start(spec)]
-    state = vehicle.drive_vehicle(m, commands, record, constants, record[k.STEPS] * period)
+    friction = m[layout.FRICTION] * vehicle.slipperiness(record, spec, constants)
+    state = vehicle.drive_vehicle(
+        m, commands, record, constants, record[k.STEPS] * period, friction
+    )
     return end_period(
         m, record, state, bits, spec, constants, table, observation, key, episode, work
     )

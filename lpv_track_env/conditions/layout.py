@@ -64,7 +64,8 @@ MAX_FIX_AGE, MAX_COMMAND_AGE, ESTIMATOR, CALIBRATE = (
     GNSS_PERIOD + 1, GNSS_PERIOD + 2, GNSS_PERIOD + 3, GNSS_PERIOD + 4,
 )  # fmt: skip
 COMMAND_CAPACITY, FIX_CAPACITY = GNSS_PERIOD + 5, GNSS_PERIOD + 6
-INITIAL = GNSS_PERIOD + 7
+STRETCH_START, STRETCH_END, STRETCH_FACTOR = GNSS_PERIOD + 7, GNSS_PERIOD + 8, GNSS_PERIOD + 9
+INITIAL = GNSS_PERIOD + 10
 """Initial variances of the filter, (9,)."""
 SETTINGS = INITIAL + filtering.STATES
 """Settings of the filter."""
@@ -130,6 +131,8 @@ def spec_of(
                 float(conditions.calibrate_steering),
                 commands,
                 fixes,
+                *conditions.slippery_stretch,
+                conditions.slippery_factor,
             ],
             conditions.filter_settings.initial_variances,
             conditions.filter_settings.as_array(vehicle, friction),

@@ -11,7 +11,7 @@ from lpv_track_env.conditions import WIND_LEVER, layout
 from lpv_track_env.draws import gaussian
 from lpv_track_env.integration import integrate_with
 from lpv_track_env.tyres import compiled_constants
-from trajectories.compilation import compiled_in_place, compiled_internal
+from trajectories.compilation import compiled, compiled_in_place, compiled_internal
 
 Array = NDArray[Any]
 
@@ -152,18 +152,31 @@ def advance_servos(m: Array, commands: Array, braking: Any, begins: Any, h: Any)
     return a, delta
 
 
+@compiled
+def slipperiness(record: Array, spec: Array, constants: Array) -> Any:
+    """Return the factor of the friction where the vehicle is: 1 but on a slippery stretch."""
+    s, length = record[k.ARC_LENGTH], constants[k.LENGTH]
+    if constants[k.CLOSED] > 0.5:
+        s -= length * math.floor(s / length)
+    slippery = spec[layout.STRETCH_START] <= s < spec[layout.STRETCH_END]
+    return spec[layout.STRETCH_FACTOR] if slippery else 1.0
+
+
 @compiled_in_place
 def drive_vehicle(
-    m: Array, commands: Array, record: Array, constants: Array, now: Any
+    m: Array, commands: Array, record: Array, constants: Array, now: Any, friction: Any
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """Return the true state after a control period; writes servos and mean inputs into `m`."""
+    """Return the true state after a control period on a road of some friction.
+
+    Writes servos and mean inputs into `m`.
+    """
     p, q = constants, layout.PLANT
     substeps = int(p[k.SUBSTEPS])
     h = p[k.PERIOD] / substeps
     vx, vy, psi, r = record[VX], record[VY], record[PSI], record[YAW_RATE]
     x, y = record[X], record[Y]
     tyre = compiled_constants(
-        m[layout.FRICTION], p[k.HEIGHT], m[q], m[q + 2], m[q + 3], m[q + 4], m[q + 5]
+        friction, p[k.HEIGHT], m[q], m[q + 2], m[q + 3], m[q + 4], m[q + 5]
     )
     total_a = total_delta = 0.0
     windy = m[layout.WIND_SPEED] > 0.0 or m[layout.GUST_SPEED] > 0.0

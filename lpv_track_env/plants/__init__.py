@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 
 from lpv_track_env import kernels
 from lpv_track_env.conditions import episode as conditions_episode
+from lpv_track_env.conditions.layout import FRICTION, STRETCH_FACTOR
+from lpv_track_env.conditions.vehicle import slipperiness
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.naming import choose
 
@@ -149,9 +151,12 @@ class PlantEpisode:
 
         `friction` multiplies that of the plant's road; inf leaves it.
         """
-        if isinstance(self.plant, RoadPlant):
-            self.plant.set_friction(friction if friction < math.inf else 1.0)
+        self._set_friction(friction)
         self.plant.begin(record[:6].copy(), float(record[kernels.STEERING]))
+
+    def _set_friction(self, friction: float, factor: float = 1.0) -> None:
+        if isinstance(self.plant, RoadPlant):
+            self.plant.set_friction(factor * (friction if friction < math.inf else 1.0))
 
     def advance(self, episode: Array, table: Array, *conditioned: Any) -> tuple[float, ...]:
         """Drive one control period in place of `kernels.advance`, with its arguments and result.
@@ -164,6 +169,11 @@ class PlantEpisode:
         if math.isfinite(episode[0]) and math.isfinite(episode[1]):
             if conditioned:
                 vehicle, spec = conditioned[:2]
+                if spec[STRETCH_FACTOR] != 1.0:
+                    record = episode[kernels.RECORD : kernels.CONSTANTS]
+                    constants = episode[kernels.CONSTANTS : kernels.OBSERVATION]
+                    factor = slipperiness(record, spec, constants)
+                    self._set_friction(float(vehicle[FRICTION]), float(factor))
                 a, delta, bits = conditions_episode.command_under_conditions(episode, vehicle, spec)
             else:
                 a, delta, bits = kernels.command(episode)
