@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from trajectories import files, shapes
+from trajectories import files, lane_changes, shapes
 from trajectories.arguments import instance_of, shown
 from trajectories.curvature import PathStatistics, signed_waypoint_curvature
 from trajectories.naming import suggestion
@@ -89,10 +89,14 @@ HAIRPIN_LIMITS = SpeedLimits(
 
 
 def names() -> list[str]:
-    """Names that `load` knows; it also loads each of `RANDOM` with any other SEED >= 0."""
+    """Names that `load` knows.
+
+    It also loads each of `RANDOM` with any other SEED >= 0, and each of `lane_changes.NAMES` with
+    any other WIDTH of a vehicle, m.
+    """
     return [
         *PUBLISHED, *(f"{name}-raw" for name in PUBLISHED), *ANALYTIC,
-        *(f"{kind}-0" for kind in RANDOM),
+        *(f"{kind}-1.8" for kind in lane_changes.NAMES), *(f"{kind}-0" for kind in RANDOM),
     ]  # fmt: skip
 
 
@@ -115,8 +119,8 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
         return _drivable(name)
     if name.endswith("-raw") and name[:-4] in PUBLISHED:
         return _raw(name[:-4])
-    if name in ANALYTIC:
-        return _analytic(name)
+    if (shape := _analytic(name) if name in ANALYTIC else _lane_change(name)) is not None:
+        return shape
     kind, _, seed = name.rpartition("-")
     if kind in RANDOM and seed.isdecimal():
         if len(seed) > SEED_DIGITS:
@@ -124,8 +128,11 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
         return _random(kind, int(seed))
     if name.endswith(".csv") or os.path.isfile(name):  # noqa: PTH113  Path's raises for long names
         return files.read(Path(name))
-    known = suggestion(name, names(), " and the random ones with any other seed")
+    known = suggestion(name, names(), " and others by their SEED or WIDTH")
     raise ValueError(f"unknown trajectory {shown(name)}; {known}, or give a .csv file")
+
+
+_lane_change = lru_cache(maxsize=64)(lane_changes.load)
 
 
 @lru_cache(maxsize=256)

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.run.rollout import Trace
-from lpv_track_env.bicycle import VX, VY, X, Y, derivative
+from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, derivative
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import CurvatureBands, ReferencePath
+from trajectories.lane_changes import clearance, outline
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,8 @@ BANDS = CurvatureBands()
 RECOVERED, NEAR, AHEAD = 0.1, 0.05, 1e-3
 """Lateral errors (m) of a vehicle that has come back to the path and of a start on it, and heading
 error (rad) of a start along it."""
+BETWEEN_STATES = 10
+"""Poses per control period at which the distance from cones is measured."""
 KEPT = 1e-3
 """Largest excess, in a constraint's unit, that does not count as a violation."""
 
@@ -207,6 +210,41 @@ def recovery(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> d
     return result
 
 
+def cones(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
+    """Compute `cone_clearance`, the least distance (m) of the body from the lines of cones.
+
+    It is negative if the body left a lane of `path.metadata["cones"]`, see
+    `trajectories.lane_changes.clearance`; paths without cones have none. Between the trace's states
+    poses are interpolated by cubic Hermite polynomials, whose slopes are the states' velocities.
+    """
+    if "cones" not in path.metadata:
+        return {}
+    middle = 0.5 * (vehicle.front_axle_distance - vehicle.rear_axle_distance)
+    corners = outline(vehicle.length, vehicle.width, middle)
+    x, y, heading = poses(trace.time, trace.state)
+    least = clearance(path.metadata["cones"], x, y, heading, corners)
+    return {"cone_clearance": least} if np.isfinite(least) else {}
+
+
+def poses(time: Array, state: Array) -> Array:
+    """Return x, y (m) and heading (rad) at and between states, (3, m), from states (n + 1, 6)."""
+    vx, vy, psi = state[:, VX], state[:, VY], state[:, PSI]
+    values = state[:, [X, Y, PSI]]
+    slopes = np.column_stack(
+        [
+            vx * np.cos(psi) - vy * np.sin(psi), vx * np.sin(psi) + vy * np.cos(psi),
+            state[:, YAW_RATE],
+        ]
+    )  # fmt: skip
+    u = np.linspace(0.0, 1.0, BETWEEN_STATES, endpoint=False)[:, None, None]
+    step = np.diff(time)[:, None]
+    between = (
+        (1.0 + 2.0 * u) * (1.0 - u) ** 2 * values[:-1] + u * u * (3.0 - 2.0 * u) * values[1:]
+        + step * (u * (1.0 - u) ** 2 * slopes[:-1] - u * u * (1.0 - u) * slopes[1:])
+    )  # fmt: skip
+    return np.vstack([between.swapaxes(0, 1).reshape(-1, 3), values[-1:]]).T
+
+
 METRICS: tuple[Callable[[Trace, ReferencePath, VehicleParameters], dict[str, float]], ...] = (
     tracking,
     by_band,
@@ -214,6 +252,7 @@ METRICS: tuple[Callable[[Trace, ReferencePath, VehicleParameters], dict[str, flo
     violations,
     knowledge,
     recovery,
+    cones,
 )
 """Functions whose entries form a case's `metrics`; add your own here."""
 

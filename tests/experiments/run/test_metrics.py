@@ -1,6 +1,7 @@
 """Every metric on episodes computed by hand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from experiments.run.rollout import Trace
 from lpv_track_env import vehicle
 from lpv_track_env.bicycle import derivative
 from trajectories import ReferencePath, load
+from trajectories.lane_changes import clearance, outline
 
 CAR = vehicle.load("m2-minibus")
 SPEED = 5.0
@@ -301,3 +303,26 @@ def test_recovery_from_a_start_on_the_path():
     # With no side of its own every error counts.
     assert recovered([0.0, 0.8, -0.2, 0.0])["overshoot"] == 0.8
     assert recovered([0.0, 0.05, -0.02]) == {"overshoot": 0.05, "recovery_time": 0.0}
+
+
+def test_cones_are_measured_between_the_states_too():
+    """A circle of 10 m about (0, 10): the car is between the cones between two states only."""
+    rate = SPEED / 10.0
+    path = replace(straight(), metadata={"cones": [[-0.5, 0.5, -1.5, 5.0]]})
+    time = np.array([-0.8, 0.8])
+    psi = rate * time
+    state = np.column_stack(
+        [np.full(2, SPEED), np.zeros(2), psi, np.full(2, rate), 10.0 * np.sin(psi),
+         10.0 - 10.0 * np.cos(psi)]
+    )  # fmt: skip
+    trace = episode(np.zeros(2), state=state, time=time)
+    values = metrics.evaluate(trace, path, CAR)
+    middle = 0.5 * (CAR.front_axle_distance - CAR.rear_axle_distance)
+    corners = outline(CAR.length, CAR.width, middle)
+    fine = rate * np.linspace(-0.8, 0.8, 1001)
+    exact = clearance(
+        path.metadata["cones"], 10.0 * np.sin(fine), 10.0 - 10.0 * np.cos(fine), fine, corners
+    )
+    assert values["cone_clearance"] == pytest.approx(exact, abs=0.03)
+    assert clearance(path.metadata["cones"], *state[:, [4, 5, 2]].T, corners) == math.inf
+    assert "cone_clearance" not in metrics.evaluate(drive(), straight(), CAR)
