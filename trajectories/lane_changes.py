@@ -52,7 +52,7 @@ MARGIN = 0.1
 RAMP = 2.0
 """m over which curvature may change: price of its slope beside its size."""
 LIMITS = SpeedLimits(
-    max_speed=10.0, max_lateral_acceleration=4.0, max_acceleration=1.5, end_speed=10.0
+    max_speed=10.0, max_lateral_acceleration=6.0, max_acceleration=1.5, end_speed=10.0
 )
 """Limits of the speed that a path has unless it is driven at a fixed one."""
 
