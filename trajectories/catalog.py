@@ -14,7 +14,7 @@ from trajectories.arguments import instance_of, shown
 from trajectories.curvature import PathStatistics, signed_waypoint_curvature
 from trajectories.naming import suggestion
 from trajectories.path import SPACING, ReferencePath
-from trajectories.random_paths import GENERATOR, limit_path, random_path
+from trajectories.random_paths import GENERATOR, circuit, limit_path, random_path
 from trajectories.speed import SpeedLimits, plan_speed
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ PUBLISHED: dict[str, Published] = {
 ANALYTIC = (
     "straight", "circle", "figure-eight", "double-lane-change", "sine", "u-turn", "hairpins",
 )  # fmt: skip
-RANDOM = ("random", "random-fast", "random-limit")
+RANDOM = ("random", "random-fast", "random-limit", "circuit")
 """Kinds of random paths, named KIND-SEED."""
 SHAPE_LIMITS = SpeedLimits(
     max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5, end_speed=3.0
@@ -137,8 +137,8 @@ _lane_change = lru_cache(maxsize=64)(lane_changes.load)
 
 @lru_cache(maxsize=256)
 def _random(kind: str, seed: int) -> ReferencePath:
-    if kind == "random-limit":
-        return limit_path(seed)
+    if kind in {"random-limit", "circuit"}:
+        return limit_path(seed) if kind == "random-limit" else circuit(seed)
     return random_path(seed, fast=kind == "random-fast")
 
 

@@ -1,6 +1,7 @@
-"""Random paths by a seed: for training, and at a known share of grip for benchmarks."""
+"""Random paths by a seed: for training, at a known share of grip, and closed ones for laps."""
 
 import math
+from itertools import count
 
 import numpy as np
 
@@ -14,6 +15,17 @@ SEED = Whole(0, 2**128 - 1)
 """Rule of the seed of a random path."""
 GRIPS = tuple(round(0.5 + 0.05 * step, 2) for step in range(10))
 """Lateral accelerations of limit paths as shares of g; the seed's last digit chooses one."""
+
+CIRCUIT_LENGTHS = (500.0, 900.0)
+CIRCUIT_RADII = (12.0, 60.0)
+CIRCUIT_ANGLES = tuple(math.radians(angle) for angle in (12.0, 140.0))
+"""Least and largest change of heading in a turn of a circuit, rad."""
+STRAIGHT = 5.0
+"""Shortest straight of a circuit, m."""
+APART = 15.0
+"""Least distance of different parts of a circuit, m."""
+SAME_PART = 45.0
+"""m of arc length up to which points are of the same part: half a turn of the tightest turns."""
 
 Range = tuple[float, float]
 
@@ -72,17 +84,93 @@ def limit_path(seed: int) -> ReferencePath:
     """
     seed = SEED.of("seed", seed)
     rng, grip = np.random.default_rng(seed), GRIPS[seed % len(GRIPS)]
-    limits = SpeedLimits(
-        max_speed=float(rng.uniform(20.0, 30.0)), max_lateral_acceleration=grip * GRAVITY,
-        max_acceleration=2.0, max_deceleration=3.0, max_jerk=4.0, end_speed=10.0,
-        max_total_acceleration=grip * GRAVITY,
-    )  # fmt: skip
+    limits = _limits(rng, grip)
     wanted = float(rng.uniform(500.0, 900.0))
     segments = _segments(rng, limits, wanted, (12.0, 80.0), (20.0, 200.0))
     return shapes.from_geometry(
         shapes.build(segments), limits, f"random-limit-{seed}",
         source=f"random-limit segments, seed {seed}", generator=GENERATOR, grip=grip,
     )  # fmt: skip
+
+
+def circuit(seed: int) -> ReferencePath:
+    """Draw a closed path of 500 to 900 m: turns of 12 to 60 m radius between straights.
+
+    The turns round the corners of a polygon that is drawn about a point, so some lead to either
+    side. Different parts of the path are at least `APART` from each other. It starts in the middle
+    of its longest straight. Speed limits are those of `limit_path` for the same seed's last digit.
+
+    Raises
+    ------
+    ValueError
+        If the seed is no whole number from 0 to 2^128 - 1.
+    """
+    seed = SEED.of("seed", seed)
+    rng, grip = np.random.default_rng(seed), GRIPS[seed % len(GRIPS)]
+    limits = _limits(rng, grip)
+    geometry = next(found for _ in count() if (found := _closed(rng, limits)) is not None)
+    return shapes.from_geometry(
+        geometry, limits, f"circuit-{seed}", closed=True,
+        source=f"circuit segments, seed {seed}", generator=GENERATOR, grip=grip,
+    )  # fmt: skip
+
+
+def _limits(rng: np.random.Generator, grip: float) -> SpeedLimits:
+    return SpeedLimits(
+        max_speed=float(rng.uniform(20.0, 30.0)), max_lateral_acceleration=grip * GRAVITY,
+        max_acceleration=2.0, max_deceleration=3.0, max_jerk=4.0, end_speed=10.0,
+        max_total_acceleration=grip * GRAVITY,
+    )  # fmt: skip
+
+
+def _closed(rng: np.random.Generator, limits: SpeedLimits) -> shapes.Geometry | None:
+    """Draw a polygon and round its corners; None if that does not make a circuit."""
+    corners = int(rng.integers(8, 13))
+    angles = 2.0 * math.pi * (np.arange(corners) + rng.uniform(-0.3, 0.3, corners)) / corners
+    radii = rng.uniform(0.25, 1.0, corners)
+    points = np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
+    edges = np.roll(points, -1, axis=0) - points
+    perimeter = 1.1 * float(rng.uniform(*CIRCUIT_LENGTHS))
+    edges *= perimeter / np.hypot(*edges.T).sum()
+    lengths, heading = np.hypot(*edges.T), np.arctan2(edges[:, 1], edges[:, 0])
+    # Turn k leads from edge k - 1 to edge k.
+    turning = np.angle(np.exp(1j * (heading - np.roll(heading, 1))))
+    if not ((np.abs(turning) > CIRCUIT_ANGLES[0]) & (np.abs(turning) < CIRCUIT_ANGLES[1])).all():
+        return None
+    turns, tangents = [], np.zeros(corners)
+    for k in range(corners):
+        radius = float(np.exp(rng.uniform(*np.log(CIRCUIT_RADII))))
+        room = 0.5 * (min(lengths[k - 1], lengths[k]) - STRAIGHT)
+        while True:
+            turn = shapes.fit([shapes.Segment(turn=float(turning[k]), radius=radius)], limits)[0]
+            rounded = shapes.build([turn])
+            tangents[k] = rounded.x[-1] - rounded.y[-1] / math.tan(turn.turn)
+            if tangents[k] <= room:
+                break
+            radius *= 0.9
+            if radius < CIRCUIT_RADII[0]:
+                return None
+        turns.append(turn)
+    straights = lengths - tangents - np.roll(tangents, -1)
+    segments: list[shapes.Segment] = []
+    first = int(np.argmax(straights))
+    for k in ((np.arange(corners) + first + 1) % corners).tolist():
+        segments += [turns[k], shapes.Segment(length=float(straights[k]))]
+    half = shapes.Segment(length=0.5 * float(straights[first]))
+    geometry = shapes.build([half, *segments[:-1], half])
+    shortest, longest = CIRCUIT_LENGTHS
+    within = shortest <= geometry.arc_length[-1] <= longest
+    return geometry if within and _apart(geometry) >= APART else None
+
+
+def _apart(geometry: shapes.Geometry) -> float:
+    """Return the least distance of points more than `SAME_PART` of a lap from each other, m."""
+    every = slice(0, -1, 8)
+    s, points = geometry.arc_length[every], np.column_stack([geometry.x, geometry.y])[every]
+    along = np.abs(s[:, None] - s)
+    along = np.minimum(along, geometry.arc_length[-1] - along)
+    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    return float(distances[along > SAME_PART].min())
 
 
 def _segments(

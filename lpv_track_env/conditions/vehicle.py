@@ -175,9 +175,7 @@ def drive_vehicle(
     h = p[k.PERIOD] / substeps
     vx, vy, psi, r = record[VX], record[VY], record[PSI], record[YAW_RATE]
     x, y = record[X], record[Y]
-    tyre = compiled_constants(
-        friction, p[k.HEIGHT], m[q], m[q + 2], m[q + 3], m[q + 4], m[q + 5]
-    )
+    tyre = compiled_constants(friction, p[k.HEIGHT], m[q], m[q + 2], m[q + 3], m[q + 4], m[q + 5])
     total_a = total_delta = 0.0
     windy = m[layout.WIND_SPEED] > 0.0 or m[layout.GUST_SPEED] > 0.0
     braking = stop_acceleration(m, p)

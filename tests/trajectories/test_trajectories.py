@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from trajectories import PUBLISHED, ReferencePath, load, names, random_path, statistics
 from trajectories.path import SPACING
+from trajectories.random_paths import circuit
 from trajectories.speed import GRAVITY
 
 SIX = ("T1", "T2", "T3", "T4", "T5", "T6")
@@ -118,7 +119,9 @@ def test_every_name_gives_a_sound_path(name: str) -> None:
 
 
 def test_closed_names() -> None:
-    assert {name for name in EVERY if load(name).closed} == {"circle", "figure-eight"}
+    assert {name for name in EVERY if load(name).closed} == {
+        "circle", "circuit-0", "figure-eight",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -161,6 +164,28 @@ def test_limit_paths_use_their_grip(seed: int) -> None:
     path = load(f"random-limit-{seed}")
     lateral = path.speed**2 * np.abs(path.curvature) / GRAVITY
     assert lateral.max() == pytest.approx(0.5 + 0.05 * seed, rel=0.02)
+
+
+@given(seed=st.integers(0, 2**63))
+@settings(max_examples=3, deadline=None)
+def test_circuits_are_closed_and_apart_from_themselves(seed: int) -> None:
+    path = load(f"circuit-{seed}")
+    check_contract(path, f"circuit-{seed}")
+    assert path.closed
+    assert 500.0 <= path.length <= 900.0
+    assert np.hypot(path.x[-1], path.y[-1]) < 1e-7
+    assert path.heading[-1] == pytest.approx(2.0 * math.pi, abs=1e-9)
+    assert path.curvature[[0, -1]] == pytest.approx(0.0, abs=1e-12)
+    assert 1.0 / 60.0 <= np.abs(path.curvature).max() <= 1.0 / 12.0 + 1e-9
+    points = np.column_stack([path.x, path.y])[:-1:3]
+    apart = np.linalg.norm(points[:, None] - points, axis=2)
+    along = np.abs(path.arc_length[:-1:3, None] - path.arc_length[:-1:3])
+    assert apart[np.minimum(along, path.length - along) > 45.0].min() > 14.9
+    assert path.metadata["grip"] == pytest.approx(0.5 + 0.05 * (seed % 10), abs=1e-12)
+
+
+def test_circuits_repeat_with_their_seed() -> None:
+    np.testing.assert_array_equal(circuit(0).table, load("circuit-0").table)
 
 
 def test_a_section_is_the_part_of_the_path() -> None:
