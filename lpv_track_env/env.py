@@ -18,11 +18,12 @@ from lpv_track_env.conditions import episode as conditions_episode
 from lpv_track_env.conditions import load as load_conditions
 from lpv_track_env.conditions.layout import FRICTION, ConditionedVehicle, info_of
 from lpv_track_env.draws import random_key
-from lpv_track_env.episodes import single_info
+from lpv_track_env.episodes import INFO, REWARD_TERMS, single_info
 from lpv_track_env.observation import PREVIEW_PERIOD, PREVIEW_STEPS, ObservationLayout
 from lpv_track_env.plants import PlantEpisode
-from lpv_track_env.reward import TERMS, RewardWeights
-from lpv_track_env.task import Task, action_space, checked_period, reference
+from lpv_track_env.reference import SpeedChoice, reference
+from lpv_track_env.reward import RewardWeights
+from lpv_track_env.task import Task, action_space, checked_period
 from lpv_track_env.validation import (
     check_finite,
     checked_options,
@@ -42,13 +43,6 @@ if TYPE_CHECKING:
     from lpv_track_env.rendering import Renderer
 
 RESET_OPTIONS = ("trajectory", "vehicle", *episodes.GIVEN)
-INFO: dict[str, Any] = dict.fromkeys(
-    (
-        "lateral_error", "heading_error", "speed_error", "arc_length", "state", "reward_terms",
-        "clipped",
-    )
-)  # fmt: skip
-REWARD_TERMS = dict.fromkeys(TERMS, 0.0)
 
 
 class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -118,8 +112,10 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         A name (`trajectories.names()`), a file, or a `ReferencePath`.
     vehicle
         A preset's name (`lpv_track_env.vehicle.VEHICLES`), a .json file or `VehicleParameters`.
-    speed_mode, fixed_speed
+    speed_mode, fixed_speed, grip
         "variable": the path's own speeds. "fixed": one, by default the highest within its limits.
+        "grip": the fastest profile of the vehicle that uses this share of the grip that the nominal
+        friction gives (`lpv_track_env.reference`).
     conditions
         "simulation" (perfect actuators, sensors, knowledge of the vehicle), "realtime" (our model
         of a vehicle's runs), a `lpv_track_env.conditions.Conditions`, or a dictionary of its
@@ -161,6 +157,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         conditions: str | Conditions | dict[str, Any] = "simulation",
         control_period: float = 0.05,
         render_mode: str | None = None,
+        grip: float | None = None,
         *,
         preview_steps: int = PREVIEW_STEPS,
         preview_period: float = PREVIEW_PERIOD,
@@ -176,12 +173,12 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if render_mode is not None:
             choose("render_mode", render_mode, tuple(self.metadata["render_modes"]))
         self.render_mode = render_mode
-        self._speed = (speed_mode, fixed_speed)
-        car = load_vehicle(vehicle)
+        self._speed = SpeedChoice(speed_mode, fixed_speed, grip)
+        car, given = load_vehicle(vehicle), load_conditions(conditions)
         period = checked_period(control_period)
         self.plant = plant
         self.base_task = Task(
-            path=reference(trajectory, car, speed_mode, fixed_speed),
+            path=reference(trajectory, car, self._speed, plant, given),
             vehicle=car,
             control_period=period,
             layout=ObservationLayout(preview_steps, preview_period),
@@ -190,7 +187,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             time_limit=time_limit,
             initial_error_range=initial_error_range,
             random_start=random_start,
-            conditions=load_conditions(conditions),
+            conditions=given,
         )
         fps = max(round(1.0 / self.base_task.control_period), 1)
         self.metadata = {**self.metadata, "render_fps": fps}
@@ -235,8 +232,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _plant_of(self, task: Task) -> PlantEpisode | None:
         if getattr(self, "task", None) is task:
             return self._plant
-        plant = plants.make(self.plant, task.vehicle)
-        return None if plant is None else PlantEpisode(plant)
+        return plants.episode_of(self.plant, task.vehicle)
 
     def _take_table(self, table: NDArray[np.float64]) -> None:
         self._table = table
@@ -283,8 +279,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     @property
     def friction_range(self) -> tuple[float, float]:
         """Least and largest friction of tyres and road, inf without a limit."""
-        given = (math.inf,) * 2 if self.conditions is None else self.conditions.ends("friction")
-        return given if self._plant is None else self._plant.friction_range(*given)
+        return plants.friction_range(self._plant, self.conditions)
 
     @property
     def friction(self) -> float:
@@ -382,9 +377,9 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if not {"trajectory", "vehicle"} & set(options):
             return self.base_task
         car = load_vehicle(options.get("vehicle", self.base_task.vehicle))
-        path = self.base_task.path
-        if "trajectory" in options:
-            path = reference(options["trajectory"], car, *self._speed)
+        path = options.get("trajectory", self.base_task.path)
+        if "trajectory" in options or self._speed.mode == "grip":
+            path = reference(path, car, self._speed, self.plant, self.conditions)
         return replace(self.base_task, path=path, vehicle=car)
 
     def step(

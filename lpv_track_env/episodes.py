@@ -26,6 +26,15 @@ TRAJECTORY_DRAW, VEHICLE_DRAW, START_DRAW, LATERAL_DRAW, HEADING_DRAW, SPEED_DRA
 GIVEN = ("arc_length", "lateral_error", "heading_error", "speed_error", "speed")
 """Starting values that reset options may give, in the order of `given` in `begin`."""
 
+INFO: Infos = dict.fromkeys(
+    (
+        "lateral_error", "heading_error", "speed_error", "arc_length", "state", "reward_terms",
+        "clipped",
+    )
+)  # fmt: skip
+REWARD_TERMS = dict.fromkeys(TERMS, 0.0)
+"""Infos and reward terms to be copied and filled, which is faster than to make them."""
+
 ROLLING_DECELERATION = 6
 """Index of mu g in the constants."""
 

@@ -1,16 +1,13 @@
 """Task of an environment: path, vehicle, periods, limits, and their numbers for the kernels."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-import trajectories
 from lpv_track_env.bicycle import longest_substep
 from lpv_track_env.conditions import Conditions
 from lpv_track_env.observation import ObservationLayout
@@ -19,12 +16,7 @@ from lpv_track_env.validation import LARGEST_ERROR
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 from trajectories.arguments import Number, flag, instance_of, numbers, shown
-from trajectories.importers import imported
-from trajectories.naming import choose
 from trajectories.projection import tightest_turn
-from trajectories.speed import constant_speed
-
-SPEED_MODES = ("variable", "fixed")
 
 Array = NDArray[np.float64]
 
@@ -32,7 +24,6 @@ Array = NDArray[np.float64]
 PERIOD = Number(0.001, 1.0, "s")
 """Rule of a control period."""
 CORRIDOR = Number(0.0, math.inf, "m", above=True)
-SPEED = Number(0.0, 1000.0, "m/s", above=True)
 TIME_LIMIT = Number(0.0, 1e6, "s", above=True)
 """Rule of a time limit; at its end, 11 days, a vehicle that stands still would be forgotten."""
 ERROR_RANGE = Number(0.0, LARGEST_ERROR)
@@ -44,53 +35,6 @@ SPEED_ROUNDING = 1e-6
 def checked_period(value: float) -> float:
     """Return a control period (s) as a float, or raise a ValueError if it makes no sense."""
     return PERIOD.of("control_period", value)
-
-
-def reference(
-    trajectory: str | Path | ReferencePath,
-    parameters: VehicleParameters,
-    speed_mode: str,
-    fixed_speed: float | None,
-) -> ReferencePath:
-    """Load the path to track; set its speed by the mode, at most the vehicle's highest speed."""
-    path = trajectories.load(trajectory)
-    choose("speed_mode", speed_mode, SPEED_MODES)
-    if speed_mode == "fixed":
-        speed = (
-            constant_speed(path) if fixed_speed is None else SPEED.of("fixed_speed", fixed_speed)
-        )
-        path = path.with_speed(speed, speed_mode="fixed")
-    elif fixed_speed is not None:
-        raise ValueError("fixed_speed needs speed_mode='fixed'")
-    fastest = parameters.speed_range[1]
-    if path.speed.max() > fastest:
-        message = f"path {shown(path.name)}: speed lowered to the vehicle's {fastest:g} m/s"
-        warnings.warn(message, UserWarning, stacklevel=4)
-        noted = [*path.metadata.get("warnings", []), message]
-        path = path.with_speed(np.minimum(path.speed, fastest), warnings=noted)
-    if imported(path) and (bend := too_sharp_bend(path, parameters)):
-        warnings.warn(bend, UserWarning, stacklevel=4)
-    return path
-
-
-def too_sharp_bend(path: ReferencePath, car: VehicleParameters) -> str:
-    """Describe the bend that a vehicle can follow least, with the limit that binds; "" if none."""
-    curvature = np.abs(path.curvature)
-    by_steering, by_sideslip = car.sharpest_turns(path.speed)
-    largest = np.minimum(by_steering, by_sideslip)
-    k = int(np.argmax(curvature / largest))
-    if curvature[k] <= largest[k]:
-        return ""
-    limit = (
-        f"its steering angle of {car.max_steering_angle:.3g} rad"
-        if by_steering[k] < by_sideslip[k]
-        else f"its limit |vy| <= {car.max_lateral_velocity_ratio:g} vx"
-    )
-    return (
-        f"path {shown(path.name)}: bend of {1.0 / curvature[k]:.1f} m radius at "
-        f"{path.arc_length[k]:.1f} m, {limit} lets vehicle {shown(car.name)} turn on "
-        f"{1.0 / largest[k]:.1f} m or more at {path.speed[k]:.3g} m/s"
-    )
 
 
 def action_space(vehicles: Sequence[VehicleParameters]) -> spaces.Space[NDArray[np.float32]]:

@@ -5,9 +5,12 @@ from lateral acceleration, steering rate and top speed is then linear in b, exce
 bound |a'| <= j b^(-1/2). Its right side is convex in b, so linearising it about the last profile
 tightens it, and every iterate is feasible (Lipp and Boyd, Minimum-time speed optimisation over a
 fixed path, 2014, for the variable b; the linearisation of the jerk bound is this project's).
+A closed path is a periodic problem: its differences go on over the seam.
 """
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,25 +24,27 @@ Array = NDArray[np.float64]
 
 GRAVITY = 9.81
 """m/s^2."""
-GRID = 1.0
-"""Largest spacing of the linear programmes' grid, m."""
+GRID, COARSEST_GRID, FINE_CELLS = 1.0, 2.0, 3000
+"""Largest spacing of the linear programmes' grid, m, and that of a path with more cells than
+these: their number stays, until their length is the second."""
 ITERATIONS = 6
 """Largest number of linear programmes."""
+SETTLED = 1e-4
+"""Relative change of a lap's time from which on a closed path needs no further programme."""
 STEERING_MARGIN = 0.96
 """Share of the steering rate that is used."""
 JERK_MARGIN = 0.92
 """Share of the jerk that is used: at low speed the grid overshoots by up to 8 %."""
-SEAM = 1e-6
-"""Largest difference of the speeds at a lap's ends, m/s: a jerk of some mm/s^3."""
-MORE_LAPS = 4
-"""Attempts with one more lap at either end until the ends of the middle one meet."""
 LIMIT = Number(1e-3, 1e6)
 """Rule of every limit of a profile, in SI units."""
 SPACINGS = Number(1e-3, 1e9, "m")
-LONG_LAP = 5_000.0
-"""m: lap from which a part of it, not all, is planned before and after."""
+TRANSFER = Number(0.0, 1e3)
+LEAST_LATERAL = 0.1
+"""Share of the lateral acceleration that load transfer leaves at least."""
 LONGEST = 40_000.0
-"""m: longest path that is planned, all laps of a closed one included; it takes minutes."""
+"""m: longest path that is planned; it takes some ten seconds."""
+PLANS = 64
+"""Number of profiles that are kept, so that none is planned twice in a row."""
 FACETS = 4
 """Facets of a quarter of the polygon within the circle of `max_total_acceleration`; at worst the
 polygon is 2 % smaller, at zero longitudinal or lateral acceleration it touches the circle."""
@@ -72,11 +77,15 @@ class SpeedLimits:
     max_total_acceleration
         m/s^2, of the vector of longitudinal and lateral acceleration: what a tyre that brakes lacks
         in the turn. None: each has its own bound alone.
+    front_load_transfer, rear_load_transfer
+        Share by which the lateral acceleration that is left beside `max_total_acceleration` falls
+        if all of that accelerates, or brakes: load leaves the front axle, or the rear one. In
+        proportion for less.
 
     Raises
     ------
     ValueError
-        If a limit is not a number from 0.001 to 1e6.
+        If a limit is not a number from 0.001 to 1e6, or a transfer not one from 0 to 1000.
     """
 
     max_speed: float
@@ -89,11 +98,17 @@ class SpeedLimits:
     end_speed: float = 1.5
     min_speed: float = 1.0
     max_total_acceleration: float | None = None
+    front_load_transfer: float = 0.0
+    rear_load_transfer: float = 0.0
 
     def __post_init__(self) -> None:
         given = [name for name, value in vars(self).items() if value is not None]
         needed = {item.name for item in fields(self) if item.default is not None}
-        check_fields(self, dict.fromkeys(sorted(needed | set(given)), LIMIT), "speed limits: ")
+        rules = {
+            name: TRANSFER if name.endswith("_transfer") else LIMIT
+            for name in sorted(needed | set(given))
+        }
+        check_fields(self, rules, "speed limits: ")
 
     @property
     def deceleration(self) -> float:
@@ -104,7 +119,12 @@ class SpeedLimits:
 
 
 def speed_caps(
-    curvature: Array, spacing: float, limits: SpeedLimits, share: Array | float = 1.0
+    curvature: Array,
+    spacing: float,
+    limits: SpeedLimits,
+    share: Array | float = 1.0,
+    *,
+    closed: bool = False,
 ) -> Array:
     """Pointwise bound on speed (n,), m/s, by top speed, lateral acceleration and steering rate.
 
@@ -113,7 +133,10 @@ def speed_caps(
     bent = np.maximum(np.abs(curvature), 1e-9)
     lateral = np.sqrt(share * limits.max_lateral_acceleration / bent)
     steering = np.arctan(limits.wheelbase * curvature)
-    slope = np.maximum(np.abs(np.gradient(steering, spacing)), 1e-12)
+    slope = np.gradient(steering, spacing)
+    if closed:
+        slope[[0, -1]] = (steering[1] - steering[-2]) / (2.0 * spacing)
+    slope = np.maximum(np.abs(slope), 1e-12)
     caps = np.minimum(lateral, STEERING_MARGIN * limits.max_steering_rate / slope)
     bounded: Array = np.minimum(limits.max_speed, np.maximum(caps, limits.min_speed))
     return bounded
@@ -129,17 +152,15 @@ def plan_speed(
 ) -> Array:
     """Plan the fastest jerk-limited speed profile (n,), m/s, for a `curvature` (n,), 1/m.
 
-    An open path starts and ends at `limits.end_speed`. A closed path is planned over three laps, or
-    over more if it takes them to reach full speed, and the middle lap is kept, so its ends meet.
-    Laps of `LONG_LAP` or more are planned with as much before and after as reaches full speed.
+    An open path starts and ends at `limits.end_speed`; the profile of a closed one is periodic,
+    its last node the first again.
 
     Raises
     ------
     RuntimeError
         If the linear programme finds no profile; the message contains the solver's.
     ValueError
-        If the path, with the laps that it takes to reach full speed, is longer than `LONGEST`, or
-        an argument is of another kind.
+        If the path is longer than `LONGEST`, or an argument is of another kind.
     """
     instance_of("limits", limits, SpeedLimits, "SpeedLimits")
     spacing, curvature = SPACINGS.of("spacing", spacing), array("curvature", curvature)
@@ -151,49 +172,53 @@ def plan_speed(
     share = array("share", share)
     if share.shape not in {(), curvature.shape} or not (share > 0.0).all() or share.max() > 1e3:
         raise ValueError("share must be positive numbers, one or as many as there are curvatures")
-    if closed:
-        lap, n = spacing * (len(curvature) - 1), len(curvature) - 1
-        weakest = min(limits.max_acceleration, limits.deceleration)
-        run_up = limits.max_speed * (
-            0.5 * limits.max_speed / weakest + 2.0 * weakest / limits.max_jerk
-        )
-        # Whole laps before and after; a long lap needs no more of them than the way to full speed.
-        run_up = np.ceil(run_up / lap) * lap if lap < LONG_LAP else min(4.0 * run_up, lap)
-        _check_length(2.0 * run_up + lap)
-        more = max(round(run_up / spacing), 1)
-        shares = np.broadcast_to(share, curvature.shape)
-        # The jerk bound lets a stop affect speeds far away: plan more until the ends meet.
-        for around in range(more, more + MORE_LAPS * min(more, n), min(more, n)):
-            if around > more and spacing * (2 * around + n) > LONGEST:
-                break
-            nodes = np.arange(-around, n + around + 1) % n
-            nodes[-1] = nodes[-1] or n
-            speed = plan_speed(curvature[nodes], spacing, limits, share=shares[nodes])
-            speed = speed[around : around + n + 1].copy()
-            if abs(speed[-1] - speed[0]) < SEAM:
-                break
-        speed[-1] = speed[0]
-        return speed
     length = spacing * (len(curvature) - 1)
-    _check_length(length)
-    caps = speed_caps(curvature, spacing, limits, share)
-    cells = max(int(np.ceil(length / GRID)), 8)
+    if not length <= LONGEST:
+        raise ValueError(
+            f"a speed profile over {length:.4g} m is too long: at most {LONGEST:g} m are planned"
+        )
+    return _planned(curvature.tobytes(), spacing, limits, bool(closed), share.tobytes()).copy()
+
+
+@lru_cache(maxsize=PLANS)
+def _planned(
+    curvature: bytes, spacing: float, limits: SpeedLimits, closed: bool, share: bytes
+) -> Array:
+    """Plan as `plan_speed`, whose arrays are given as bytes."""
+    if (total := limits.max_total_acceleration) is not None:
+        limits = replace(
+            limits,
+            max_lateral_acceleration=min(limits.max_lateral_acceleration, total),
+            max_acceleration=min(limits.max_acceleration, total),
+            max_deceleration=min(limits.deceleration, total),
+        )
+    kappa, shares = np.frombuffer(curvature), np.frombuffer(share)
+    caps = speed_caps(kappa, spacing, limits, shares, closed=closed)
+    length = spacing * (len(kappa) - 1)
+    grid = min(max(length / FINE_CELLS, GRID), COARSEST_GRID)
+    cells = max(int(np.ceil(length / grid)), 8)
     coarse = np.linspace(0.0, length, cells + 1)
-    fine = np.linspace(0.0, length, len(curvature))
+    fine = np.linspace(0.0, length, len(kappa))
+    # The nodes of a lap: its last one is the first.
+    lap = slice(-1 if closed else None)
     # A coarse node takes the lowest cap around it, so that no cap is lost between nodes.
     reach = int(np.ceil(0.5 * length / cells / spacing))
-    nodes = np.rint(coarse / spacing).astype(int).clip(0, len(caps) - 1)
+    nodes = np.rint(coarse[lap] / spacing).astype(int).clip(0, len(caps) - 1)
     lowest, bent = (
-        np.lib.stride_tricks.sliding_window_view(np.pad(values, reach, mode="edge"), 2 * reach + 1)
-        for values in (caps, np.abs(curvature))
+        np.lib.stride_tricks.sliding_window_view(
+            np.pad(values[lap], reach, mode="wrap" if closed else "edge"), 2 * reach + 1
+        )[nodes]
+        for values in (caps, np.abs(kappa))
     )
-    squared = _plan(lowest[nodes].min(axis=1) ** 2, bent[nodes].max(axis=1), length / cells, limits)
-    smoothed = _smooth(squared, fine * (cells / length))
+    squared = _plan(
+        lowest.min(axis=1) ** 2, bent.max(axis=1), length / cells, limits, closed=closed
+    )
+    smoothed = _smooth(squared, fine * (cells / length), closed=closed)
     planned: Array = np.sqrt(np.minimum(smoothed, limits.max_speed**2))
     return planned
 
 
-def replanned(path: ReferencePath, limits: SpeedLimits) -> ReferencePath:
+def replanned(path: ReferencePath, limits: SpeedLimits, **metadata: Any) -> ReferencePath:
     """Return the same geometry with the profile that `limits` allow, which its metadata name.
 
     Raises
@@ -202,29 +227,27 @@ def replanned(path: ReferencePath, limits: SpeedLimits) -> ReferencePath:
         As `plan_speed`.
     """
     speed = plan_speed(path.curvature, path.spacing, limits, closed=path.closed)
-    return path.with_speed(speed, limits=asdict(limits))
+    return path.with_speed(speed, limits=asdict(limits), **metadata)
 
 
-def _check_length(length: float) -> None:
-    if not length <= LONGEST:
-        raise ValueError(
-            f"a speed profile over {length:.4g} m, laps to get up to speed included, is too long: "
-            f"at most {LONGEST:g} m are planned"
-        )
-
-
-def _smooth(values: Array, at: Array) -> Array:
+def _smooth(values: Array, at: Array, *, closed: bool) -> Array:
     """Evaluate the uniform quadratic B-spline with control points `values` (m,) at indices (n,).
 
     Its slope, the acceleration, is continuous and linear between the midpoints of cells, whereas
     the linear programme's is a staircase; it stays within the control points' convex hull.
     """
-    padded = np.concatenate([[2 * values[0] - values[1]], values, [2 * values[-1] - values[-2]]])
+    before, after = 2 * values[0] - values[1], 2 * values[-1] - values[-2]
+    if closed:
+        before, after = values[-1], values[0]
+        values = np.append(values, after)
+        after = values[1]
+    padded = np.concatenate([[before], values, [after]])
     node = np.rint(at).astype(int).clip(0, len(values) - 1)
     u = at - node
-    before, here, after = padded[node], padded[node + 1], padded[node + 2]
     smoothed: Array = (
-        0.5 * (0.5 - u) ** 2 * before + (0.75 - u * u) * here + 0.5 * (0.5 + u) ** 2 * after
+        0.5 * (0.5 - u) ** 2 * padded[node]
+        + (0.75 - u * u) * padded[node + 1]
+        + 0.5 * (0.5 + u) ** 2 * padded[node + 2]
     )
     return smoothed
 
@@ -234,52 +257,86 @@ def _within_circle(
 ) -> tuple[sparse.csr_matrix, Array]:
     """Bound total acceleration in the cells by `radius`: matrix on squared speeds, upper bounds.
 
-    Longitudinal acceleration is `difference` b, (m - 1,), the lateral one at either end of a cell
-    is `bent` b, (m,) 1/m. They keep within a polygon in the circle, whose facets have the normals
-    (+-cos, sin). Facets and cells that other bounds keep from it are left out. Where a speed may
-    not fall to what the lateral acceleration allows, nothing is left for braking.
+    Longitudinal acceleration is `difference` b, in the cells; the lateral one at either end of a
+    cell is `bent` b, (m,) 1/m. They keep within a polygon in the circle, whose facets have the
+    normals (+-cos, sin); load transfer lowers its corners, which tilts the facets. Facets and cells
+    that other bounds keep from it are left out. Where a speed may not fall to what the lateral
+    acceleration allows, nothing is left for braking.
     """
     bent = np.minimum(bent, radius / caps)
     lateral = sparse.diags(bent).tocsr()
+    most_lateral = bent * caps
+    first = np.arange(difference.shape[0])
+    last = (first + 1) % len(bent)
     rows = [sparse.csr_matrix((0, len(bent)))]
-    for sign, most in ((1.0, limits.max_acceleration), (-1.0, limits.deceleration)):
-        rest = np.sqrt(max(radius**2 - most**2, 0.0)) * np.cos(0.25 * np.pi / FACETS)
-        cells = np.flatnonzero(np.maximum(bent[:-1] * caps[:-1], bent[1:] * caps[1:]) > rest)
+    half = 0.25 * np.pi / FACETS
+    for sign, most, transfer in (
+        (1.0, limits.max_acceleration, limits.front_load_transfer),
+        (-1.0, limits.deceleration, limits.rear_load_transfer),
+    ):
+        rest = np.sqrt(max(radius**2 - most**2, 0.0)) * np.cos(half)
+        rest *= max(1.0 - transfer * most / radius, LEAST_LATERAL)
+        cells = np.flatnonzero(np.maximum(most_lateral[first], most_lateral[last]) > rest)
         for facet in range(FACETS):
-            if radius * np.cos(0.5 * np.pi / FACETS * (facet + 1)) < most:
-                angle = 0.5 * np.pi / FACETS * (facet + 0.5)
-                along = sign * np.cos(angle) * difference[cells]
-                rows += [along + np.sin(angle) * lateral[cells + end] for end in (0, 1)]
+            if radius * np.cos(2.0 * half * (facet + 1)) < most:
+                angle = half * (2 * facet + 1)
+                along, across = _tilted(angle, half, transfer)
+                longitudinal = sign * along * difference[cells]
+                rows += [longitudinal + across * lateral[ends[cells]] for ends in (first, last)]
     matrix = sparse.vstack(rows, format="csr")
-    return matrix, np.full(matrix.shape[0], radius * np.cos(0.25 * np.pi / FACETS))
+    return matrix, np.full(matrix.shape[0], radius * np.cos(half))
 
 
-def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits) -> Array:
+def _tilted(angle: float, half: float, transfer: float) -> tuple[float, float]:
+    """Return the normal of a facet in the unit circle whose corners load transfer has lowered.
+
+    The corners are at `angle` -+ `half`; the facet's distance, by which the normal is scaled, stays
+    that of the facet without transfer.
+    """
+    ends = np.array([angle - half, angle + half])
+    lost = 1.0 - np.maximum(1.0 - transfer * np.cos(ends), LEAST_LATERAL)
+    across = np.sin(angle) * np.sin(ends)
+    tilt, steeper = np.linalg.solve(
+        np.column_stack([np.cos(ends), across * (1.0 - lost)]), across * lost
+    )
+    return np.cos(angle) + tilt, np.sin(angle) * (1.0 + steeper)
+
+
+def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: bool) -> Array:
     """Plan the squared speed (m,) on a grid of spacing h under squared caps (m,).
 
-    `bent` is |curvature| (m,), 1/m.
+    `bent` is |curvature| (m,), 1/m. After the last node of a closed path comes the first again.
     """
     m = len(caps)
-    end = min(limits.end_speed**2, float(caps[0]), float(caps[-1]))
+    end = float(caps.min()) if closed else min(limits.end_speed**2, float(caps[0]), float(caps[-1]))
     upper = caps.copy()
-    upper[[0, -1]] = end
     lower = np.full(m, min(end, limits.min_speed**2))
-    lower[[0, -1]] = end
-    # a = D b, shape (m - 1,); change of a = E b, shape (m - 2,)
-    difference = sparse.diags([-0.5 / h, 0.5 / h], [0, 1], shape=(m - 1, m)).tocsr()
-    change = (difference[1:] - difference[:-1]).tocsr()
-    squared = _without_jerk(upper, h, limits)
-    identity = sparse.identity(m - 2, format="csr")
-    nothing = sparse.csr_matrix((m - 1, m - 2))
+    # a = D b, in the cells; change of a = E b, at the nodes between two cells
+    if closed:
+        following = sparse.identity(m, format="csr")[np.r_[1:m, 0]]
+        difference = (0.5 / h * (following - sparse.identity(m))).tocsr()
+        change = (difference - following.T @ difference).tocsr()
+        between = slice(None)
+    else:
+        upper[[0, -1]] = lower[[0, -1]] = end
+        difference = sparse.diags([-0.5 / h, 0.5 / h], [0, 1], shape=(m - 1, m)).tocsr()
+        change = (difference[1:] - difference[:-1]).tocsr()
+        between = slice(1, -1)
+    cells, inner = difference.shape[0], change.shape[0]
+    squared = _without_jerk(upper, h, limits, closed=closed)
+    identity = sparse.identity(inner, format="csr")
+    nothing = sparse.csr_matrix((cells, inner))
     circle, radius = sparse.csr_matrix((0, m)), np.empty(0)
     if (total := limits.max_total_acceleration) is not None:
         circle, radius = _within_circle(bent, caps, difference, limits, total)
     for _ in range(ITERATIONS):
-        inner = np.maximum(squared[1:-1], lower[1:-1])
+        last = np.maximum(squared, lower)[between]
         # j h b^(-1/2) linearised at b0: j h (1.5 b0^(-1/2) - 0.5 b0^(-3/2) b)
         allowed = JERK_MARGIN * limits.max_jerk * h
-        constant = 1.5 * allowed * inner**-0.5
-        slope = sparse.diags([0.5 * allowed * inner**-1.5], [1], shape=(m - 2, m)).tocsr()
+        constant = 1.5 * allowed * last**-0.5
+        slope = sparse.diags(
+            [0.5 * allowed * last**-1.5], [0 if closed else 1], shape=(inner, m)
+        ).tocsr()
         constraints = sparse.vstack(
             [
                 sparse.hstack([difference, nothing]),
@@ -288,40 +345,48 @@ def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits) -> Array:
                 sparse.hstack([slope - change, 0 * identity]),
                 sparse.hstack([change, -identity]),
                 sparse.hstack([-change, -identity]),
-                sparse.hstack([circle, sparse.csr_matrix((len(radius), m - 2))]),
+                sparse.hstack([circle, sparse.csr_matrix((len(radius), inner))]),
             ],
             format="csr",
         )
-        # Acceleration is zero at both ends, so jerk limits it in the first and the last cell.
-        standing = allowed * end**-0.5
-        faster = np.full(m - 1, limits.max_acceleration)
-        faster[0] = min(faster[0], standing)
-        slower = np.full(m - 1, limits.deceleration)
-        slower[-1] = min(slower[-1], standing)
-        bounds = np.concatenate([faster, slower, constant, constant, np.zeros(2 * (m - 2)), radius])
+        faster = np.full(cells, limits.max_acceleration)
+        slower = np.full(cells, limits.deceleration)
+        if not closed:
+            # Acceleration is zero at both ends, so jerk limits it in the first and the last cell.
+            standing = allowed * end**-0.5
+            faster[0] = min(faster[0], standing)
+            slower[-1] = min(slower[-1], standing)
+        bounds = np.concatenate([faster, slower, constant, constant, np.zeros(2 * inner), radius])
         weight = np.maximum(squared, end) ** -1.5
-        cost = np.concatenate([-weight, np.full(m - 2, CHATTER_WEIGHT)])
+        cost = np.concatenate([-weight, np.full(inner, CHATTER_WEIGHT)])
         result = linprog(
             cost,
             A_ub=constraints,
             b_ub=bounds,
             bounds=np.column_stack(
-                [np.append(lower, np.zeros(m - 2)), np.append(upper, np.full(m - 2, np.inf))]
+                [np.append(lower, np.zeros(inner)), np.append(upper, np.full(inner, np.inf))]
             ),
             method="highs",
         )
         if result.x is None:
             raise RuntimeError(f"no speed profile found: {result.message}")
         planned = result.x[:m]
-        moved = float(np.abs(np.sqrt(planned) - np.sqrt(squared)).max())
+        before, now = np.sqrt(squared), np.sqrt(planned)
         squared = planned
-        if moved < 1e-3:
+        change_of_time = abs(float((1.0 / now).sum() / (1.0 / before).sum()) - 1.0)
+        if float(np.abs(now - before).max()) < 1e-3 or (closed and change_of_time < SETTLED):
             break
     return squared
 
 
-def _without_jerk(caps: Array, h: float, limits: SpeedLimits) -> Array:
+def _without_jerk(caps: Array, h: float, limits: SpeedLimits, *, closed: bool) -> Array:
     """Compute the first iterate: a forward and a backward pass under acceleration bounds alone."""
+    if closed:
+        # The neighbours of the lowest cap do not lower it: a lap from there to there is open.
+        lowest = int(np.argmin(caps))
+        around = np.roll(caps, -lowest)
+        lap = _without_jerk(np.append(around, around[0]), h, limits, closed=False)
+        return np.roll(lap[:-1], lowest)
     squared = caps.copy()
     for k in range(1, len(squared)):
         squared[k] = min(squared[k], squared[k - 1] + 2 * limits.max_acceleration * h)

@@ -63,12 +63,14 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     seeds = shared.seeds_of(options)
     names = options.agents or suites.default_agents()
-    if options.trajectories or options.vehicles or options.speed_modes:
+    speed_modes = shared.speed_modes_of(options)
+    if options.trajectories or options.vehicles or speed_modes:
         specs = suites.grid(
             names,
             options.trajectories or suites.SIX,
             vehicles=options.vehicles or ("m2-minibus",),
-            speed_modes=options.speed_modes or ("variable",),
+            speed_modes=speed_modes or ("variable",),
+            grips=options.grip,
             seeds=seeds,
         )
         suite = "custom"

@@ -14,7 +14,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shared.add_agents(parser, "default: lpv-nmpc; several drive the same case, side by side")
     shared.add_trajectories(parser, ["T2"])
     shared.add_vehicles(parser, ["m2-minibus"])
-    shared.add_speed_modes(parser, ["variable"])
+    shared.add_speed_modes(parser, None)
     shared.add_conditions(parser)
     shared.add_seed(parser)
     shared.add_agent_settings(parser)
@@ -51,12 +51,14 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     names = options.agents or ["lpv-nmpc"]
     settings = shared.agent_settings(options.agent_set, names)
+    speed_modes = shared.speed_modes_of(options) or ["variable"]
     cases = [
         Case(
             agent=name,
             trajectory=shared.only_one("trajectory", options.trajectories),
             vehicle=shared.only_one("vehicle", options.vehicles),
-            speed_mode=shared.only_one("speed mode", options.speed_modes),
+            speed_mode=shared.only_one("speed mode", speed_modes),
+            grip=shared.only_one("share of grip", options.grip or [None]),
             conditions=shared.conditions_of(options),
             seed=options.seed,
             agent_settings=settings[name],

@@ -215,9 +215,30 @@ def add_vehicles(
 
 
 def add_speed_modes(parser: argparse.ArgumentParser, default: list[str] | None) -> None:
-    """Add `--speed-modes` alias `--speed-mode`, one mode or both."""
-    choices = ["variable", "fixed"]
+    """Add `--speed-modes` alias `--speed-mode`, and `--grip`; `speed_modes_of` reads both."""
+    choices = ["variable", "fixed", "grip"]
     _add_names(parser, "--speed-modes", "--speed-mode", default=default, choices=choices)
+    parser.add_argument(
+        "--grip", nargs="+", type=number(0.05, 2.0), default=[], metavar="SHARE",
+        help="speed mode grip: plan the speed for the vehicle and this share of what friction "
+        "allows, e.g. 0.8",
+    )  # fmt: skip
+
+
+def speed_modes_of(options: argparse.Namespace) -> list[str]:
+    """Return the modes of `--speed-modes`: "grip" if there are none but a `--grip`.
+
+    Raises
+    ------
+    ValueError
+        If there is a share of grip without the mode, or the mode without a share.
+    """
+    modes: list[str] = options.speed_modes or []
+    if options.grip and not modes:
+        return ["grip"]
+    if bool(options.grip) != ("grip" in modes):
+        raise ValueError("--speed-modes grip and --grip SHARE belong together: give both")
+    return modes
 
 
 def _add_names(parser: argparse.ArgumentParser, *names: str, **more: Any) -> None:
@@ -242,7 +263,7 @@ class _OneSpelling(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
-def only_one(kind: str, names: Sequence[str]) -> str:
+def only_one(kind: str, names: Sequence[Any]) -> Any:
     """Return the one name that was given.
 
     Raises
@@ -251,7 +272,7 @@ def only_one(kind: str, names: Sequence[str]) -> str:
         If there are several.
     """
     if len(names) > 1:
-        raise ValueError(f"one {kind} is driven at a time, not {' '.join(names)}")
+        raise ValueError(f"one {kind} is driven at a time, not {' '.join(map(str, names))}")
     return names[0]
 
 

@@ -191,7 +191,8 @@ def label(spec: Spec) -> str:
     if "scene" in spec:
         return f"{spec['agent']} {spec['scene']} seed {spec['seed']}"
     path = path_name(spec["trajectory"])
-    return f"{spec['agent']} {path} {spec['vehicle']} {spec['speed_mode']}"
+    grip = "" if spec.get("grip") is None else f" {spec['grip']:g}"
+    return f"{spec['agent']} {path} {spec['vehicle']} {spec['speed_mode']}{grip}"
 
 
 def selected(

@@ -36,8 +36,9 @@ from experiments.run.result_schema import as_stored
 from experiments.run.rollout import Rollout, rollout
 from lpv_track_env import conditions, plants, vehicle
 from lpv_track_env.env import PathTrackingEnv
+from lpv_track_env.reference import SpeedChoice, reference
 from lpv_track_env.reward import RewardWeights
-from lpv_track_env.task import SPEED_MODES, check_start, reference
+from lpv_track_env.task import check_start
 from lpv_track_env.validation import checked_start
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.arguments import instance_of, shortened
@@ -178,6 +179,7 @@ class Case(BaseCase):
     computing: Mapping[str, Any] = field(default_factory=dict)
     regime: str = ""
     start: Mapping[str, float] = field(default_factory=dict)
+    grip: float | None = None
 
     @property
     def reset_options(self) -> dict[str, Any]:
@@ -207,8 +209,8 @@ class Case(BaseCase):
             weights_from(weights)
         trajectories.load(self.trajectory)
         instance_of("regime", self.regime, str, "text")
-        choose("speed mode", self.speed_mode, SPEED_MODES)
-        conditions.load(self.plain_conditions)
+        speed = SpeedChoice(self.speed_mode, self.fixed_speed, self.grip)
+        given = conditions.load(self.plain_conditions)
         if self.computing and self.conditions == "simulation":
             raise ValueError("computing times are delays, which conditions 'simulation' have not")
         self.make_computing()
@@ -218,9 +220,10 @@ class Case(BaseCase):
         for key in self.vehicle_changes:
             choose("vehicle field", key, VEHICLE_FIELDS)
         car = self.make_vehicle()
-        plants.make(self.env_settings.get("plant", plants.BICYCLE), car)
+        plant = self.env_settings.get("plant", plants.BICYCLE)
+        plants.make(plant, car)
         if self.start:
-            path = reference(self.trajectory, car, self.speed_mode, self.fixed_speed)
+            path = reference(self.trajectory, car, speed, plant, given)
             check_start(checked_start(self.start, path.length), path, car)
 
     def packages(self) -> tuple[str, ...]:
@@ -258,6 +261,7 @@ class Case(BaseCase):
             vehicle=self.make_vehicle(),
             speed_mode=self.speed_mode,
             fixed_speed=self.fixed_speed,
+            grip=self.grip,
             conditions=self.plain_conditions,
             control_period=self.control_period,
             **{**self.resolved_env_settings(), **settings},

@@ -73,6 +73,7 @@ class Stored(TypedDict, total=False):
     seed: int
     speed_mode: Name
     fixed_speed: Number | None
+    grip: Number | None
     control_period: Annotated[float, Meta(gt=0.0, le=3600.0)]
     vehicle_changes: Settings
     agent_settings: Settings

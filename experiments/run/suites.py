@@ -139,10 +139,15 @@ def grid(
     *,
     vehicles: Iterable[str] = ("m2-minibus",),
     speed_modes: Iterable[str] = ("variable",),
+    grips: Iterable[float] = (),
     seeds: Iterable[int] = (0,),
     **common: Any,
 ) -> list[Spec]:
-    """Return every combination, the slowest agents first so that a pool ends evenly."""
+    """Return every combination, the slowest agents first so that a pool ends evenly.
+
+    In the speed mode "grip" each of `grips` is driven.
+    """
+    shares = [{"grip": grip} for grip in grips] or [{}]
     named = sorted(agent_names, key=lambda name: not name.startswith("lpv-nmpc"))
     return [
         {
@@ -151,11 +156,13 @@ def grid(
             "vehicle": vehicle,
             "speed_mode": mode,
             "seed": seed,
+            **(share if mode == "grip" else {}),
             **common,
         }
         for agent in named
         for vehicle in vehicles
         for mode in speed_modes
+        for share in (shares if mode == "grip" else shares[:1])
         for trajectory in trajectories
         for seed in seeds
     ]

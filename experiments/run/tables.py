@@ -64,6 +64,7 @@ class Setting(NamedTuple):
     vehicle_changes: str
     speed_mode: str
     fixed_speed: float | None
+    grip: float | None
     raw: bool
     conditions: str
     computing: str
@@ -89,7 +90,8 @@ class Setting(NamedTuple):
         if changed := json.loads(self.vehicle_changes):
             parts.append(f"with {_changes(changed)}")
         speed = "" if self.fixed_speed is None else f" {self.fixed_speed} m/s"
-        parts.append(f"{self.speed_mode} speed{speed}")
+        grip = None if self.grip is None else f"{self.grip:g} of grip"
+        parts.append(grip or f"{self.speed_mode} speed{speed}")
         if self.raw:
             parts.append("raw waypoints")
         if self.conditions != DEFAULT.conditions:
@@ -117,6 +119,7 @@ def setting_of(case: Result) -> Setting:
         vehicle_changes=text("vehicle_changes", {}),
         speed_mode=str(case.get("speed_mode", "?")),
         fixed_speed=case.get("fixed_speed"),
+        grip=case.get("grip"),
         raw=str(case.get("trajectory")).endswith("-raw"),
         conditions=text("conditions", Case.conditions),
         computing=text("computing", {}),

@@ -117,7 +117,9 @@ class HighwayTrackEnv(PathTrackingEnv):
     v0: first version.
     """
 
-    @forwards_arguments(PathTrackingEnv, "trajectory", "speed_mode", "fixed_speed", "random_start")
+    @forwards_arguments(
+        PathTrackingEnv, "trajectory", "speed_mode", "fixed_speed", "grip", "random_start"
+    )
     def __init__(
         self,
         settings: dict[str, Any],

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpv_track_env import kernels
+from lpv_track_env.conditions import Conditions
 from lpv_track_env.conditions import episode as conditions_episode
 from lpv_track_env.conditions.layout import FRICTION, STRETCH_FACTOR
 from lpv_track_env.conditions.vehicle import slipperiness
@@ -124,6 +125,20 @@ def make(plant: str | Factory, vehicle: VehicleParameters) -> Plant | None:
     module, _, attribute = PLANTS[plant].partition(":")
     factory: Factory = getattr(importlib.import_module(module), attribute)
     return factory(vehicle)
+
+
+def episode_of(plant: str | Factory, vehicle: VehicleParameters) -> "PlantEpisode | None":
+    """Make a vehicle's plant for an environment; None for `bicycle`. Errors as in `make`."""
+    made = make(plant, vehicle)
+    return None if made is None else PlantEpisode(made)
+
+
+def friction_range(
+    plant: "PlantEpisode | None", conditions: Conditions | None
+) -> tuple[float, float]:
+    """Return the least and largest friction of tyres and road, inf without a limit."""
+    given = (math.inf,) * 2 if conditions is None else conditions.ends("friction")
+    return given if plant is None else plant.friction_range(*given)
 
 
 class PlantEpisode:

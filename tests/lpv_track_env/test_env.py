@@ -737,7 +737,7 @@ BAD_ARGUMENTS: dict[str, tuple[dict[str, Any], str]] = {
     "vehicle": ({"vehicle": "m2"}, r"unknown vehicle 'm2'; known: m2-minibus, course-car"),
     "speed_mode": (
         {"speed_mode": "fix"},
-        r"unknown speed_mode 'fix'; known: variable, fixed \(nearest: fixed\)",
+        r"unknown speed_mode 'fix'; known: variable, fixed, grip \(nearest: fixed\)",
     ),
     "speed_mode-none": ({"speed_mode": None}, "unknown speed_mode None"),
     "conditions": (
@@ -752,6 +752,12 @@ BAD_ARGUMENTS: dict[str, tuple[dict[str, Any], str]] = {
     "fixed_speed-zero": ({"speed_mode": "fixed", "fixed_speed": 0.0}, "fixed_speed must be posit"),
     "fixed_speed-nan": (
         {"speed_mode": "fixed", "fixed_speed": math.nan}, "fixed_speed must be positive",
+    ),
+    "grip": ({"grip": 0.8}, "grip needs speed_mode='grip'"),
+    "grip-none": ({"speed_mode": "grip"}, "speed_mode='grip' needs grip, a share"),
+    "grip-zero": ({"speed_mode": "grip", "grip": 0.0}, r"grip must be in \[0.05, 2\], not 0.0"),
+    "grip-fixed": (
+        {"speed_mode": "grip", "grip": 0.8, "fixed_speed": 5.0}, "fixed_speed needs speed_mode='f",
     ),
     "period": ({"control_period": 0.0}, r"control_period must be in \[0.001, 1\] s, not 0.0"),
     "period-nan": ({"control_period": math.nan}, "control_period must be in"),

@@ -1,0 +1,122 @@
+"""References planned by grip: analytic answers, the axles' limits, vehicles and friction."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lpv_track_env  # noqa: F401  registers the environments
+from lpv_track_env import tyres, vehicle
+from lpv_track_env.env import PathTrackingEnv
+from lpv_track_env.vector_env import PathTrackingVectorEnv
+from lpv_track_env.vehicle import VehicleParameters
+from trajectories import ReferencePath, SpeedLimits, load, shapes
+from trajectories.speed import GRAVITY
+
+CAR = vehicle.load("bmw-320i")
+
+
+def planned(trajectory: str | ReferencePath = "circle", **arguments: Any) -> ReferencePath:
+    given = {"vehicle": CAR, "speed_mode": "grip", **arguments}
+    return PathTrackingEnv(trajectory, **given).path
+
+
+def share_used(path: ReferencePath, car: VehicleParameters, friction: float) -> np.ndarray:
+    """Return the share of its friction that the weaker axle uses in each cell."""
+    ax = np.diff(path.speed**2) / (2.0 * path.spacing)
+    ay = 0.5 * np.abs((path.curvature * path.speed**2)[1:] + (path.curvature * path.speed**2)[:-1])
+    transfer = car.centre_of_gravity_height / GRAVITY
+    front = 1.0 - transfer / car.rear_axle_distance * ax
+    rear = 1.0 + transfer / car.front_axle_distance * ax
+    side = ay / np.minimum(front, rear)
+    return np.hypot(ax, side) / (friction * GRAVITY)
+
+
+@pytest.mark.parametrize("grip", [0.3, 0.8, 1.2])
+@pytest.mark.parametrize("friction", [None, 0.6])
+def test_a_circle_is_driven_at_this_share_of_its_limit(grip: float, friction: float | None) -> None:
+    given = {} if friction is None else {"conditions": {"name": "ideal", "friction": friction}}
+    path = planned(grip=grip, **given)
+    expected = math.sqrt(grip * (friction or 1.0) * GRAVITY * 30.0)
+    np.testing.assert_allclose(path.speed, expected, rtol=1e-9)
+    assert path.metadata["grip"] == grip
+    assert path.metadata["speed_mode"] == "grip"
+
+
+def test_the_middle_of_a_range_of_friction_counts() -> None:
+    drawn, known = (
+        planned(grip=0.5, conditions={"name": "ideal", "friction": given})
+        for given in ([0.4, 0.8], 0.6)
+    )
+    np.testing.assert_allclose(drawn.speed, known.speed, rtol=1e-12)
+
+
+def test_a_plant_counts_with_its_own_road() -> None:
+    pytest.importorskip("vehiclemodels", reason="needs the extra plants")
+    env = PathTrackingEnv("circle", CAR, "grip", grip=0.5, plant="drift")
+    assert env.friction != 1.0
+    np.testing.assert_allclose(env.path.speed, math.sqrt(0.5 * env.friction * GRAVITY * 30.0))
+
+
+@pytest.mark.parametrize("grip", [0.5, 0.9])
+@pytest.mark.parametrize("friction", [0.5, 1.0])
+def test_no_axle_uses_more_than_its_share(grip: float, friction: float) -> None:
+    strong = CAR.replace(
+        longitudinal_acceleration_range=(-8.0, 6.0), acceleration_range=(-9.0, 7.0), max_jerk=40.0
+    )
+    path = load("hairpins")
+    given = {"name": "ideal", "friction": friction}
+    fast = planned(path, vehicle=strong, grip=grip, conditions=given)
+    used = share_used(fast, strong, friction)
+    assert 0.97 * grip < used.max() <= 1.005 * grip
+    acceleration = fast.acceleration[:-1]
+    a_max = tyres.of(strong, friction)[0]
+    assert acceleration.max() <= min(6.0, a_max) + 1e-6
+    assert acceleration.min() >= -min(8.0, a_max) - 1e-6
+    # Both bounds are reached, so the profile is not slower than it must be.
+    assert acceleration.max() > 0.97 * min(6.0, grip * friction * GRAVITY, a_max)
+    assert acceleration.min() < -0.97 * min(8.0, grip * friction * GRAVITY, a_max)
+
+
+def test_a_straight_is_driven_at_the_vehicles_limits() -> None:
+    path = planned(load("straight"), grip=0.9)
+    low, high = CAR.longitudinal_acceleration_range
+    assert path.acceleration.max() == pytest.approx(high, abs=1e-6)
+    assert path.acceleration.min() == pytest.approx(low, abs=1e-6)
+    jerk = path.speed[1:-1] * np.diff(path.acceleration[:-1]) / path.spacing
+    assert 0.9 * CAR.max_jerk < np.abs(jerk).max() <= CAR.max_jerk
+    slow = planned(load("straight"), grip=0.9, vehicle=CAR.replace(speed_range=(0.0, 12.0)))
+    assert slow.speed.max() == 12.0
+
+
+def test_vehicles_of_one_environment_have_their_own_speeds() -> None:
+    cars = ["bmw-320i", "m2-minibus"]
+    env = PathTrackingVectorEnv(
+        num_envs=2, trajectory=["T2", "T4"], vehicle=cars, speed_mode="grip", grip=0.7
+    )
+    for task in env.tasks:
+        alone = PathTrackingEnv(task.path.name, task.vehicle, "grip", grip=0.7)
+        np.testing.assert_array_equal(task.path.speed, alone.path.speed)
+    assert not np.array_equal(env.tasks[0].path.speed, env.tasks[1].path.speed)
+    single = PathTrackingEnv("T4", cars[0], "grip", grip=0.7)
+    single.reset(options={"vehicle": cars[1]})
+    np.testing.assert_array_equal(single.path.speed, env.tasks[3].path.speed)
+    single.reset(options={"trajectory": "T2"})
+    np.testing.assert_array_equal(single.path.speed, env.tasks[0].path.speed)
+
+
+def test_an_open_path_begins_and_ends_at_its_own_speed() -> None:
+    path = planned(load("hairpins"), grip=0.8)
+    assert path.speed[[0, -1]] == pytest.approx([28.0, 28.0])
+
+
+def test_a_bend_of_a_known_curvature_is_the_bottleneck() -> None:
+    limits = SpeedLimits(10.0, 2.0, 1.5)
+    bend = shapes.fit(shapes.parse("S 200 | L 180 r25 | S 200"), limits)
+    path = shapes.from_geometry(shapes.build(bend), limits, "bend")
+    fast = planned(path, grip=0.6)
+    radius = 1.0 / np.abs(path.curvature).max()
+    assert fast.speed[len(fast.speed) // 2] == pytest.approx(
+        math.sqrt(0.6 * GRAVITY * radius), rel=0.005
+    )
