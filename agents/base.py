@@ -186,12 +186,17 @@ def check_compatible(
 def check_vehicle(
     name: str, task: DrivingTask, vehicle: object, *, how: str = "trained", stacklevel: int = 3
 ) -> None:
-    """Warn if what has been trained or tuned for a vehicle, given by name, drives another one."""
-    if isinstance(vehicle, str) and vehicle != task.vehicle.name:
+    """Warn if what has been trained or tuned for a vehicle drives another one.
+
+    `vehicle` is its name, or a list of names.
+    """
+    vehicles = [vehicle] if isinstance(vehicle, str) else vehicle
+    if isinstance(vehicles, list) and task.vehicle.name not in vehicles:
         # Results hold warnings: a shipped policy is named without this installation's folder.
         shown = name.replace(f"{CHECKPOINTS}{os.sep}", "")
         warnings.warn(
-            f"{shown} was {how} for vehicle {vehicle!r}, not for {task.vehicle.name!r}",
+            f"{shown} was {how} for vehicle {', '.join(map(repr, vehicles))}, not for "
+            f"{task.vehicle.name!r}",
             UserWarning,
             stacklevel=stacklevel,
         )

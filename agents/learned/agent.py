@@ -16,6 +16,7 @@ from agents.base import (
     checked_task,
 )
 from agents.inputs import foreign, observation_rows, started_rows
+from agents.learned.context import with_context
 from agents.learned.network import Network
 from agents.learned.policy import ACTIONS, Policy, read
 from agents.nmpc.rti_agent import RtiMemory, RtiNmpc, RtiRow
@@ -53,7 +54,7 @@ class LearnedPolicy:
             vehicle=self.policy.training.get("vehicle"), stacklevel=4,
         )  # fmt: skip
         self._size = task.layout.size
-        self._network = Network.of(self.policy, *task.action_bounds)
+        self._network = Network.of(with_context(self.policy, task), *task.action_bounds)
         self._base = RtiNmpc(task) if self.policy.origin == "lpv-nmpc" else None
         # Called with zero rows to trigger compilation here, not in the first control period.
         none = observation_rows(np.zeros((0, self._size)), self._size)

@@ -76,6 +76,8 @@ class Kind:
         Key -> keys of the objects in its spec besides `OBJECTS`.
     stages
         Names of the linear stages in front of the layers in the weights file.
+    optional
+        Keys that a spec may have, too.
     """
 
     format: str
@@ -83,6 +85,7 @@ class Kind:
     keys: frozenset[str]
     objects: Mapping[str, frozenset[str]] = field(default_factory=dict)
     stages: tuple[str, ...] = ()
+    optional: frozenset[str] = frozenset()
 
 
 def check_suffix(kind: Kind, file: Path) -> None:
@@ -113,7 +116,7 @@ def read_spec(kind: Kind, file: Path) -> Spec:
             f"{file}: format is {shown(form)}, this version reads {kind.format!r}: "
             "retrain or upgrade"
         )
-    _check_keys(kind, file, "", spec, kind.keys | COMMON_KEYS)
+    _check_keys(kind, file, "", spec, kind.keys | COMMON_KEYS, kind.optional)
     for name, keys in {**kind.objects, **OBJECTS}.items():
         _check_keys(kind, file, f"{name}.", spec[name], keys)
     if spec["digest"] != digest_of(spec):
@@ -251,12 +254,15 @@ def _content(file: Path, most: int, noun: str) -> bytes:
         ) from None
 
 
-def _check_keys(kind: Kind, file: Path, where: str, found: Any, known: frozenset[str]) -> None:
-    """Check that an object has exactly the known keys."""
+def _check_keys(
+    kind: Kind, file: Path, where: str, found: Any, known: frozenset[str],
+    optional: frozenset[str] = frozenset(),
+) -> None:  # fmt: skip
+    """Check that an object has exactly the known keys, and perhaps optional ones."""
     again = f"write the {kind.noun} again"
     if not isinstance(found, dict):
         raise ValueError(f"{file}: {where.rstrip('.')} must be an object: {again}")  # noqa: TRY004
-    for what, keys in (("unknown", found.keys() - known), ("no", known - found.keys())):
+    for what, keys in (("unknown", found.keys() - known - optional), ("no", known - found.keys())):
         if keys:
             raise ValueError(
                 f"{file}: {what} key {shown(where + min(keys))}: {again} with this version"

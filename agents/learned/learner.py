@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from agents.base import DrivingTask
 from agents.delay import DelayMemory, NearFuture
+from agents.learned.context import with_context
 from agents.learned.policy import ORIGINS, Origin, Policy
 from agents.learned.sb3_policies import network_of
 from agents.sb3 import AdapterVecEnv, TrackingVecEnv
@@ -36,7 +38,7 @@ class Scaling:
     """Scaling of observations to features x, and of outputs u in [-1, 1] to actions.
 
     x = clip(W o + b, -limit, limit) with o the observation in SI units, followed by the NMPC's
-    action if that is the origin; action = origin + centre + half u.
+    action if that is the origin, and by the context; action = origin + centre + half u.
     """
 
     feature_weight: NDArray[np.float32]
@@ -50,6 +52,8 @@ class Scaling:
     """(2,) [m/s^2, rad]."""
     half: NDArray[np.float64]
     """(2,) [m/s^2, rad]."""
+    context: tuple[str, ...] = ()
+    """Names of the task's constants that follow, of `agents.learned.context.CONTEXT`."""
 
     @property
     def features(self) -> int:
@@ -62,13 +66,24 @@ class Scaling:
         return np.clip(x, -self.feature_limit, self.feature_limit, out=x)
 
 
-def usual_scaling(task: DrivingTask, origin: Origin = "actuators") -> Scaling:
+CONTEXT_SCALES = {
+    "wheelbase": (0.5, 3.0), "front_axle_share": (5.0, 0.45), "front_compliance": (50.0, 0.02),
+    "rear_compliance": (50.0, 0.02), "yaw_ratio": (1.0, 0.8), "max_steering_angle": (1.0, 0.8),
+    "max_steering_rate": (2.0, 0.5), "max_jerk": (0.2, 5.0), "inverse_least_friction": (1.0, 1.0),
+    "inverse_largest_friction": (1.0, 1.0),
+}  # fmt: skip
+"""Scale of each value of the context and the value that becomes 0."""
+
+
+def usual_scaling(
+    task: DrivingTask, origin: Origin = "actuators", *, context: tuple[str, ...] = ()
+) -> Scaling:
     """Return the scaling used in training, derived from the vehicle's ranges and the layout.
 
     Preview speeds are relative to the reference speed; the vehicle's speed appears both relative
     and absolute, lateral and heading error both coarse and fine. An action is an increment of the
     actuators' values, at most what their rates allow in a control period; or, on top of the NMPC, a
-    correction within a part of the whole action range.
+    correction within a part of the whole action range. Each value of the `context` is a feature.
     """
     choose("origin", origin, ORIGINS)
     car, layout = task.vehicle, task.layout
@@ -100,9 +115,13 @@ def usual_scaling(task: DrivingTask, origin: Origin = "actuators") -> Scaling:
         base = np.zeros((2, inputs))
         base[0, -2], base[1, -1] = 1.0 / accelerations, 1.5 / car.max_steering_angle
         weight = np.vstack([weight, base])
+    scales, middles = np.array([CONTEXT_SCALES[name] for name in context]).reshape(-1, 2).T
+    weight = block_diag(weight, np.diag(scales)) if context else weight
+    bias = np.zeros(len(weight), dtype=np.float32)
+    bias[len(bias) - len(context) :] = -scales * middles
     return Scaling(
-        weight.astype(np.float32), np.zeros(len(weight), dtype=np.float32), LIMIT, origin,
-        *_outputs(car, task.control_period, origin),
+        weight.astype(np.float32), bias, LIMIT, origin,
+        *_outputs(car, task.control_period, origin), context,
     )  # fmt: skip
 
 
@@ -121,7 +140,7 @@ class _Part:
     """One vector environment of a learner: its agent's observations, features and actions."""
 
     def __init__(self, venv: TrackingVecEnv, scaling: Scaling, task: DrivingTask) -> None:
-        self.venv, self.scaling = venv, scaling
+        self.venv, self.scaling = venv, with_context(scaling, task)
         self.solves = 0
         self._future = NearFuture(task, task.actuation) if task.delayed else None
         self._delays: DelayMemory | None = None
@@ -238,13 +257,14 @@ class LearnerVecEnv(AdapterVecEnv):
         kinds = {(task.layout, task.control_period) for task in tasks}
         if len(kinds) > 1:
             raise ValueError("all environments of a learner must share layout and control period")
-        self.task = tasks[0]
+        self.task, self.tasks = tasks[0], tasks
         self.scaling = usual_scaling(self.task) if scaling is None else scaling
         self._parts = [
             _Part(part, self.scaling, task) for part, task in zip(parts, tasks, strict=True)
         ]
         ends = np.cumsum([0, *(part.num_envs for part in parts)]).tolist()
-        self._rows = [slice(a, b) for a, b in pairwise(ends)]
+        self.rows = [slice(a, b) for a, b in pairwise(ends)]
+        """Rows of the environments of each of `venvs`; `tasks` has a task for each."""
         limit = self.scaling.feature_limit
         super().__init__(
             [part.env for part in parts],
@@ -299,7 +319,7 @@ class LearnerVecEnv(AdapterVecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed environment i with seed + i at the next reset."""
         seeds: list[int | None] = []
-        for rows, part in zip(self._rows, self._parts, strict=True):
+        for rows, part in zip(self.rows, self._parts, strict=True):
             seeds += part.venv.seed(None if seed is None else seed + rows.start)
         return seeds
 
@@ -313,7 +333,7 @@ class LearnerVecEnv(AdapterVecEnv):
     def step_async(self, actions: Array) -> None:
         """Send actions (n, 2) in [-1, 1]."""
         began = time.perf_counter()
-        for rows, part in zip(self._rows, self._parts, strict=True):
+        for rows, part in zip(self.rows, self._parts, strict=True):
             part.venv.step_async(part.act(actions[rows]))
         self.seconds += time.perf_counter() - began
 

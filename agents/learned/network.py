@@ -164,7 +164,7 @@ class Network:
 
     @classmethod
     def of(cls, policy: Policy, low: Array, high: Array) -> "Network":
-        """Pack a policy and the bounds (2,) of its actions, in SI units."""
+        """Pack a policy without context and the bounds (2,) of its actions, in SI units."""
         stages = [(policy.feature_weight, policy.feature_bias), *policy.layers]
         activations = ["clip", *[policy.activation] * (len(policy.layers) - 1), policy.squash]
         weights, table = pack_layers(stages, activations)

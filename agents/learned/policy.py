@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from agents.learned.context import CONTEXT
 from agents.learned.files import (
     MOST_LAYERS,
     Kind,
@@ -49,6 +50,7 @@ POLICY = Kind(
         ("activation", "squash", "origin", "centre", "half", "feature_limit", "symmetric")
     ),
     stages=("features",),
+    optional=frozenset(("context",)),
 )
 
 
@@ -57,7 +59,7 @@ class Policy:
     """A policy: features, a multilayer perceptron, and the meaning of its output.
 
     With o the observation in SI units (`lpv_track_env.observation`; for origin "lpv-nmpc" followed
-    by the base action)::
+    by the base action; then by the context)::
 
         x      = clip(W_f o + b_f, -limit, limit)
         x      = activation(W_k x + b_k)                    for every layer but the last
@@ -92,6 +94,8 @@ class Policy:
     symmetric
         Use the mean of the network's output and of its mirrored output for the mirrored
         observation as u: the policy then treats left and right alike.
+    context
+        Names of the task's constants that the features see, of `agents.learned.context.CONTEXT`.
 
     Raises
     ------
@@ -114,6 +118,7 @@ class Policy:
     half: Array
     training: Mapping[str, Any] = field(default_factory=dict)
     symmetric: bool = False
+    context: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         checked_name(self.algorithm)
@@ -134,6 +139,8 @@ class Policy:
             )
         if self.symmetric and centre[1] != 0.0:
             raise ValueError(f"a symmetric policy steers about 0, not about {centre[1]} rad")
+        context = checked_context(self.context)
+        object.__setattr__(self, "context", context)
         weight, bias = checked_layer("feature", self.feature_weight, self.feature_bias, self.inputs)
         layers = checked_layers(self.layers, len(bias), ACTIONS, "for a and delta")
         normal = {
@@ -146,14 +153,16 @@ class Policy:
 
     @property
     def inputs(self) -> int:
-        """Length of o: the observation and, for origin "lpv-nmpc", the base action."""
-        return self.layout.size + (ACTIONS if self.origin == "lpv-nmpc" else 0)
+        """Length of o: observation, base action for origin "lpv-nmpc", and context."""
+        base = ACTIONS if self.origin == "lpv-nmpc" else 0
+        return self.layout.size + base + len(self.context)
 
     @property
     def mirror(self) -> Weights:
         """Factors, 1 or -1, that exchange left and right in o, (inputs,)."""
         base = [1.0, -1.0] if self.origin == "lpv-nmpc" else []
-        return np.concatenate([self.layout.mirror, base]).astype(np.float32)
+        context = np.ones(len(self.context))
+        return np.concatenate([self.layout.mirror, base, context]).astype(np.float32)
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -183,6 +192,8 @@ def write(policy: Policy, file: str | Path) -> None:
         "feature_limit": policy.feature_limit,
         "symmetric": policy.symmetric,
     }
+    if policy.context:
+        spec["context"] = list(policy.context)
     tensors = {
         "features.weight": policy.feature_weight,
         "features.bias": policy.feature_bias,
@@ -215,6 +226,7 @@ def read(file: str | Path) -> Policy:
             feature_weight=tensors["features.weight"],
             feature_bias=tensors["features.bias"],
             layers=layers_of(tensors),
+            context=spec.get("context", ()),
             **{key: spec[key] for key in POLICY.keys | {"algorithm", "control_period", "training"}},
         )
     except ValueError as error:
@@ -266,6 +278,16 @@ def checked_name(algorithm: object) -> str:
 def checked_number(name: str, value: Any) -> float:
     """Convert a finite number to a float; booleans are refused."""
     return Number().of(name, value)
+
+
+def checked_context(names: Any) -> tuple[str, ...]:
+    """Check names of `CONTEXT`, each at most once."""
+    instance_of("context", names, list | tuple, "a list of names")
+    for name in names:
+        choose("entry of the context", name, tuple(CONTEXT))
+    if len(set(names)) != len(names):
+        raise ValueError(f"context names an entry twice: {shown(list(names))}")
+    return tuple(names)
 
 
 def _array(name: str, value: ArrayLike, dtype: type[np.floating[Any]]) -> NDArray[Any]:

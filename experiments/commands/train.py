@@ -33,13 +33,14 @@ if TYPE_CHECKING:
 EXAMPLE = "lpv-track train ppo --seed 0 --hours 0.1 --out results/ppo"
 
 PLAIN = (
-    "seed", "vehicle", "envs", "segment", "trajectories", "paths", "start", "device",
+    "seed", "vehicle", "situations", "envs", "segment", "trajectories", "paths", "start", "device",
     "control_period", "preview_steps", "preview_period",
 )  # fmt: skip
 """Options that are settings as they were given."""
 REPEATED = (
-    "vehicle", "conditions", "conditions_set", "trajectories", "paths", "envs", "segment",
-    "start", "control_period", "preview_steps", "preview_period", "set", "reward", "device",
+    "vehicle", "situations", "conditions", "conditions_set", "trajectories", "paths", "envs",
+    "segment", "start", "control_period", "preview_steps", "preview_period", "set", "reward",
+    "device",
 )  # fmt: skip
 """Options that the provenance's command repeats as they were given."""
 TRIAL_UPDATES = {"ppo": 2, "residual": 2, "sac": 50, "td3": 50, "bc": 1}
@@ -72,6 +73,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_settings(
         parser, "--conditions-set", "fields to change in each of them, e.g. friction=[0.4,1.0]"
     )
+    parser.add_argument(
+        "--situations", metavar="NAME",
+        help="set of situations in place of vehicle, conditions and paths: limits mixes vehicles, "
+        "friction, drives at the limit of grip, standing starts and starts far beside the path",
+    )  # fmt: skip
     add_trajectories(
         parser, None, "own paths in place of random ones; not those of the suites paper and learned"
     )

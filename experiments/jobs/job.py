@@ -27,9 +27,10 @@ from trajectories.fileio import checked, parse_json, read_bytes, read_json, writ
 SETTINGS, PROGRESS, VERSIONS = "settings.json", "progress.jsonl", "versions.json"
 JOBS, FIRST = "lpv-track-env jobs", "1"
 """Name of the version of what jobs compute, and the version of files that do not name it."""
-JOBS_VERSION = "2"
+JOBS_VERSION = "3"
 """It counts up with every change of environments or of the NMPC after which a job learns another
-thing: 2 has a preview of 2 s, stages that grow, and weights on the rates of inputs."""
+thing: 2 has a preview of 2 s, stages that grow, and weights on the rates of inputs; 3 validates by
+the reward of all drives together."""
 
 Line = dict[str, Any]
 
@@ -254,6 +255,11 @@ VALIDATION_EPISODES, TRAINING_EPISODES = 2 * 10**8, 10**9
 def random_names(first: int, count: int) -> list[str]:
     """Return names of random paths with seeds from `first` on, slow and fast ones in turn."""
     return [f"random-{'fast-' * (k % 2)}{first + k}" for k in range(count)]
+
+
+def limit_names(first: int, count: int) -> list[str]:
+    """Return names of paths at the limit of grip with seeds from `first` on, see `limit_path`."""
+    return [f"random-limit-{first + k}" for k in range(count)]
 
 
 def training_names(own: Sequence[str], seed: int, count: int) -> list[str]:

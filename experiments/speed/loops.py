@@ -202,8 +202,9 @@ def training(section: Section, effort: Effort, tick: Tick) -> None:
     from stable_baselines3.common.logger import Logger
 
     from experiments.jobs.job import load_paths
-    from experiments.training.loop import make_trainer, path_names
+    from experiments.training.loop import make_trainer
     from experiments.training.settings import FAST, usual
+    from experiments.training.trainer import path_names
 
     settings = usual("ppo", **{**FAST, "paths": 4})
     segment = max(settings.envs * settings.hyperparameters["rollout"], 8 * effort.learning_steps)

@@ -48,7 +48,7 @@ class CloningTrainer(Trainer):
         if start is not None:
             check_start(start, settings, env, squash="clip")
             put_layers(start.layers, self._linear)
-        self._expert = RtiNmpc(env.task)
+        self._experts = [RtiNmpc(task) for task in env.tasks]
         self._features = np.zeros((0, env.scaling.features), dtype=np.float32)
         self._labels = np.zeros((0, 2), dtype=np.float32)
         self._optimiser = torch.optim.Adam(self._net.parameters(), lr=self.rate())
@@ -80,14 +80,16 @@ class CloningTrainer(Trainer):
         """Reset every environment and drive it for `round` steps."""
         n = self.env.num_envs
         features: Array = self.env.reset()
-        memory, starts = None, np.ones(n, dtype=np.bool_)
+        memories: list[Any] = [None] * len(self._experts)
+        actions, starts = np.zeros((n, 2)), np.ones(n, dtype=np.bool_)
         by_expert = self.random.random(n) < (1.0 if not self.steps else self.hyper["expert_share"])
         noise = self.hyper["noise"] * (self.random.random(n) < 0.5)
         inputs: list[Array] = [self._features]
         labels: list[Array] = [self._labels]
         for _ in range(self.hyper["round"]):
-            actions, memory = self._expert.predict(self.env.agent_observations, memory, starts)
-            scaling = self.env.scaling
+            seen, scaling = self.env.agent_observations, self.env.scaling
+            for k, (expert, rows) in enumerate(zip(self._experts, self.env.rows, strict=True)):
+                actions[rows], memories[k] = expert.predict(seen[rows], memories[k], starts[rows])
             wanted = (actions - self.env.origins - scaling.centre) / scaling.half
             wanted = np.clip(wanted, -1.0, 1.0).astype(np.float32)
             inputs.append(features)

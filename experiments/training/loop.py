@@ -18,23 +18,20 @@ from agents.learned.storage import remove_files
 from experiments.jobs import checkpoint
 from experiments.jobs.job import (
     VALIDATION_EPISODES,
-    VALIDATION_PATHS,
     Job,
     Line,
     Listener,
     claimed,
     load_paths,
-    random_names,
     run_job,
-    training_names,
 )
 from experiments.run.case import Case, run_case
 from experiments.run.provenance import provenance
 from experiments.training.cloning import CloningTrainer
 from experiments.training.sb3_trainer import Sb3Trainer
 from experiments.training.settings import TrainingSettings
-from experiments.training.trainer import Trainer, make_learner_env
-from lpv_track_env import vehicle
+from experiments.training.situations import NEAR
+from experiments.training.trainer import Trainer, make_learner_env, path_names
 from trajectories.fileio import checked
 
 POLICY = "policy.json"
@@ -63,11 +60,6 @@ def _check_device(name: str) -> None:
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"no device {name!r} here: say --device cpu or auto ({reason})") from None
-
-
-def path_names(settings: TrainingSettings) -> list[str]:
-    """Return the names of the paths of a training."""
-    return training_names(settings.trajectories, settings.seed, settings.paths)
 
 
 def train(
@@ -177,10 +169,11 @@ class Training(Job):
         """Return where a policy comes from and what it cost, in plain JSON."""
         settings, start = self.trainer.settings, self._start
         names = path_names(settings)
+        cars = list(dict.fromkeys(part.car().name for part in settings.parts))
         return {
             "command": self.command,
             "settings": settings.as_dict(),
-            "vehicle": vehicle.load(settings.vehicle).name,
+            "vehicle": cars[0] if len(cars) == 1 else cars,
             "device": str(self.trainer.device),
             "paths": [names[0], names[-1]],
             "steps": line["steps"] + start.get("steps", 0),
@@ -214,39 +207,34 @@ class Training(Job):
 # Validation ---------------------------------------------------------------------------------------
 
 
-def validation_names(settings: TrainingSettings) -> list[str]:
-    """Return the paths of the validation: the user's own, as in training, or else random ones."""
-    if settings.trajectories:
-        return list(settings.trajectories[: settings.validation])
-    return random_names(VALIDATION_PATHS, settings.validation)
-
-
 def cases(settings: TrainingSettings, policy: Path) -> list[dict[str, Any]]:
     """Return the cases of a validation."""
     return [
         Case(
             agent=str(policy),
             trajectory=name,
-            vehicle=settings.vehicle,
-            conditions=kind,
+            vehicle=part.vehicle,
+            vehicle_changes=part.changes,
+            conditions=part.conditions,
             seed=VALIDATION_EPISODES + k,
             control_period=settings.control_period,
             env_settings={
                 "preview_steps": settings.preview_steps,
                 "preview_period": settings.preview_period,
                 "reward_weights": asdict(settings.reward_weights()),
+                **({"initial_error_range": part.errors} if part.errors != NEAR else {}),
             },
         ).as_dict()
-        for kind in settings.conditions
-        for k, name in enumerate(validation_names(settings))
+        for part in settings.parts
+        for k, name in enumerate(settings.validation_paths(part))
     ]
 
 
 def validate(settings: TrainingSettings, policy: Path) -> dict[str, float]:
     """Drive the validation cases; return the share that finished, ALE and MLE (m), steering.
 
-    `loss`, by which the best policy is chosen, is 1 minus the mean reward per second: perfect
-    tracking earns the training's reward at a rate of 1 a second.
+    `loss`, by which the best policy is chosen, is 1 minus the reward per second of all drives
+    together: perfect tracking earns the training's reward at a rate of 1 a second.
 
     Raises
     ------
@@ -259,12 +247,11 @@ def validate(settings: TrainingSettings, policy: Path) -> dict[str, float]:
             raise ValueError(f"validation on {result['trajectory']}: {result['error']}")
     finished = np.array([result["end"] == "finished" for result in results])
     ale = np.array([result["metrics"]["ale"] for result in results])
-    rewards = [
-        result["metrics"]["reward"] / max(result["metrics"]["duration"], settings.control_period)
-        for result in results
-    ]
+    reward, seconds = (
+        sum(result["metrics"][key] for result in results) for key in ("reward", "duration")
+    )
     return {
-        "loss": 1.0 - float(np.mean(rewards)),
+        "loss": 1.0 - reward / seconds,
         "finished": float(finished.mean()),
         "mean_ale": float(ale.mean()),
         "worst_mle": float(max(result["metrics"]["mle"] for result in results)),

@@ -9,8 +9,15 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from agents.learned.policy import ACTIVATIONS, ORIGINS
-from experiments.jobs.job import check_paths, plain_values
+from experiments.jobs.job import (
+    MOST_PATHS,
+    TRAINING_PATHS,
+    VALIDATION_PATHS,
+    check_paths,
+    plain_values,
+)
 from experiments.training import ALGORITHMS
+from experiments.training.situations import SITUATIONS, USUAL, Situation
 from lpv_track_env import conditions, vehicle
 from lpv_track_env.observation import PREVIEW_PERIOD, PREVIEW_STEPS
 from lpv_track_env.reward import RewardWeights
@@ -73,6 +80,9 @@ FAST: dict[str, Any] = {
 with."""
 
 
+VEHICLE, CONDITIONS = "m2-minibus", ("simulation", "realtime")
+
+
 @dataclass(frozen=True)
 class TrainingSettings:
     """A training: the same settings give the same weights, bit for bit, on the same machine.
@@ -81,7 +91,8 @@ class TrainingSettings:
     checkpoint is written, all seeds are drawn anew from (seed, segment) and all episodes restart,
     so that a resumed training equals an uninterrupted one. `conditions` share the environments
     evenly. `trajectories` are files or names; by default `paths` random ones that only this seed
-    trains on. `validation` paths are driven after every segment under each kind of conditions.
+    trains on. `situations` names a set of `SITUATIONS` in place of vehicle, conditions and paths.
+    `validation` paths are driven after every segment in each situation.
     `start` is the file of a policy whose network the training starts from.
 
     Raises
@@ -96,8 +107,9 @@ class TrainingSettings:
     envs: int
     segment: int
     seed: int = 0
-    vehicle: str = "m2-minibus"
-    conditions: tuple[Any, ...] = ("simulation", "realtime")
+    vehicle: str = VEHICLE
+    conditions: tuple[Any, ...] = CONDITIONS
+    situations: str = USUAL
     control_period: float = 0.05
     preview_steps: int = PREVIEW_STEPS
     preview_period: float = PREVIEW_PERIOD
@@ -120,11 +132,18 @@ class TrainingSettings:
         check_paths(self.trajectories, self.paths, self.seed, verb="train")
         if not self.conditions:
             raise ValueError("a training needs at least one kind of conditions")
-        if self.envs < len(self.conditions):
-            raise ValueError(f"{len(self.conditions)} conditions need as many environments")
         for given_conditions in self.conditions:
             conditions.load(given_conditions)
         vehicle.load(self.vehicle)
+        choose("situations", self.situations, (USUAL, *SITUATIONS))
+        own = self.vehicle, self.conditions, self.trajectories
+        if self.situations != USUAL and own != (VEHICLE, CONDITIONS, ()):
+            raise ValueError(
+                f"situations {self.situations!r} have vehicles, conditions and paths of their own: "
+                "leave out vehicle, conditions and trajectories"
+            )
+        if self.envs < (needed := sum(part.share for part in self.parts)):
+            raise ValueError(f"envs must be at least {needed} for these situations")
         self.reward_weights()
         self._check_segments()
 
@@ -143,6 +162,23 @@ class TrainingSettings:
                 "from a policy, the first segment fits the value function alone: "
                 f"segment must be less than steps, {self.steps}, not {self.segment}"
             )
+
+    @property
+    def parts(self) -> tuple[Situation, ...]:
+        """Situations that share the environments."""
+        if self.situations != USUAL:
+            return SITUATIONS[self.situations]
+        return tuple(Situation(self.vehicle, kind) for kind in self.conditions)
+
+    def training_paths(self, part: Situation) -> list[str]:
+        """Return the names of the paths that are trained on in a situation."""
+        own = list(self.trajectories)
+        return own or part.path_names(TRAINING_PATHS + MOST_PATHS * self.seed, self.paths)
+
+    def validation_paths(self, part: Situation) -> list[str]:
+        """Return the names of the paths of the validation in a situation."""
+        own = list(self.trajectories[: self.validation])
+        return own or part.path_names(VALIDATION_PATHS, self.validation)
 
     def reward_weights(self) -> RewardWeights:
         """Return the weights of the reward that the training maximises."""

@@ -10,11 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 import agents
+from agents.learned.context import CONTEXT
 from agents.learned.learner import LearnerVecEnv, usual_scaling
 from agents.learned.policy import Policy
 from experiments.jobs.job import episode_seed
 from experiments.training.settings import TrainingSettings
-from lpv_track_env import vehicle
+from experiments.training.situations import USUAL
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories import ReferencePath
 
@@ -24,8 +25,6 @@ Tick = Callable[[int, str], None]
 
 MODULES: dict[str, type[torch.nn.Module]] = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
 """PyTorch's modules of the activations that a policy may have."""
-INITIAL_ERRORS = (0.5, 0.1, 1.0)
-"""Range of the first errors of an episode: lateral m, heading rad, speed m/s."""
 
 
 class Trainer(ABC):
@@ -82,23 +81,41 @@ class Trainer(ABC):
         return float(first + share * (last - first))
 
 
+def path_names(settings: TrainingSettings) -> list[str]:
+    """Return the names of all paths of a training, each once."""
+    names = [name for part in settings.parts for name in settings.training_paths(part)]
+    return list(dict.fromkeys(names))
+
+
+def shared_out(settings: TrainingSettings) -> list[int]:
+    """Share the environments out among the situations; the first get those that are left over."""
+    shares = [part.share for part in settings.parts]
+    counts = [settings.envs * share // sum(shares) for share in shares]
+    left = settings.envs - sum(counts)
+    return [count + (k < left) for k, count in enumerate(counts)]
+
+
 def make_learner_env(settings: TrainingSettings, paths: list[ReferencePath]) -> LearnerVecEnv:
-    """Make the environments of a training, shared out among its conditions."""
-    kinds, count = settings.conditions, settings.envs
-    shares = [count // len(kinds) + (k < count % len(kinds)) for k in range(len(kinds))]
+    """Make the environments of a training, shared out among its situations.
+
+    `paths` are those of `path_names`, in its order.
+    """
+    parts, loaded = settings.parts, dict(zip(path_names(settings), paths, strict=True))
     envs = [
         PathTrackingVectorEnv(
-            share, paths, vehicle.load(settings.vehicle), conditions=kind,
+            count, [loaded[name] for name in settings.training_paths(part)], part.car(),
+            conditions=part.conditions,
             control_period=settings.control_period, preview_steps=settings.preview_steps,
             preview_period=settings.preview_period, reward_weights=settings.reward_weights(),
-            time_limit=settings.time_limit, initial_error_range=INITIAL_ERRORS, random_start=True,
+            time_limit=settings.time_limit, initial_error_range=part.errors, random_start=True,
             autoreset_mode="SameStep",
         )
-        for kind, share in zip(kinds, shares, strict=True)
+        for part, count in zip(parts, shared_out(settings), strict=True)
     ]  # fmt: skip
     scaling = usual_scaling(
-        agents.DrivingTask.of(envs[0].single), settings.hyperparameters["origin"]
-    )
+        agents.DrivingTask.of(envs[0].single), settings.hyperparameters["origin"],
+        context=() if settings.situations == USUAL else tuple(CONTEXT),
+    )  # fmt: skip
     return LearnerVecEnv([agents.sb3_vec_env(env) for env in envs], scaling)
 
 
@@ -127,6 +144,7 @@ def check_start(
         ("activation", wanted["activation"], policy.activation),
         ("squashing of outputs", squash, policy.squash),
         ("origin of actions", scaling.origin, policy.origin),
+        ("context", list(scaling.context), list(policy.context)),
         ("features or range of actions", True, same_scaling),
     ):
         if own != other:

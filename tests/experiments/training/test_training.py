@@ -15,6 +15,7 @@ pytest.importorskip("stable_baselines3")
 import torch
 from stable_baselines3.common.logger import Logger
 
+from agents.learned.context import CONTEXT
 from agents.learned.policy import read as read_policy
 from experiments import cli
 from experiments.jobs import checkpoint
@@ -34,8 +35,9 @@ from experiments.run.case import run_case
 from experiments.run.folder_lock import locked
 from experiments.run.suites import HELD_OUT, SIX
 from experiments.training import ALGORITHMS
-from experiments.training.loop import cases, make_trainer, path_names, train, validate
+from experiments.training.loop import cases, make_trainer, train, validate
 from experiments.training.settings import HYPERPARAMETERS, REWARD, TrainingSettings, usual
+from experiments.training.trainer import path_names
 from lpv_track_env.vehicle import VEHICLES
 from tests.helpers.policy_files import beside
 
@@ -55,6 +57,10 @@ def tiny(algorithm: str, **changes: Any) -> TrainingSettings:
         "envs": 16, "paths": 1, "validation": 1, "time_limit": 3.0, **TINY[algorithm], **changes,
     }  # fmt: skip
     return usual(algorithm, **{"segment": given["steps"] // 3, **given})
+
+
+def mixed(**changes: Any) -> TrainingSettings:
+    return tiny("bc", situations="limits", envs=61, steps=3000, **changes)
 
 
 def silent(*_: Any) -> None:
@@ -128,6 +134,7 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
     for seed in (0, 1, 999):
         settings = tiny("ppo", seed=seed, paths=1000)
         names = set(path_names(settings))
+        names |= set(path_names(mixed(seed=seed, paths=1000)))
         assert not names & seen
         seen |= names
         assert episode_seed(settings.seed, 0) >= TRAINING_EPISODES
@@ -135,10 +142,14 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
         assert np.diff(episodes).min() > settings.envs
     numbers = [int(name.rpartition("-")[2]) for name in seen]
     assert TRAINING_PATHS <= min(numbers) <= max(numbers) < VALIDATION_PATHS
-    validated = {case["trajectory"] for case in cases(tiny("ppo", validation=50), tmp_path)}
+    both = [
+        *cases(tiny("ppo", validation=50), tmp_path),
+        *cases(mixed(validation=50), tmp_path),
+    ]
+    validated = {case["trajectory"] for case in both}
     assert not validated & seen
     assert min(int(name.rpartition("-")[2]) for name in validated) >= VALIDATION_PATHS
-    drawn = {case["seed"] for case in cases(tiny("ppo", validation=50), tmp_path)}
+    drawn = {case["seed"] for case in both}
     assert VALIDATION_EPISODES <= min(drawn) <= max(drawn) < TRAINING_EPISODES
     for name in (*SIX, "T2-raw", *HELD_OUT):
         with pytest.raises(ValueError, match="is for evaluation"):
@@ -160,7 +171,11 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
         ({"reward": {"lateral": "high"}}, "must be a number"),
         ({"conditions": ("realtme",)}, "realtime"),
         ({"conditions": ()}, "at least one"),
-        ({"envs": 1}, "as many environments"),
+        ({"envs": 1}, "envs must be at least 2"),
+        ({"situations": "limit"}, "nearest: limits"),
+        ({"situations": "limits"}, "envs must be at least 28"),
+        ({"situations": "limits", "vehicle": "course-car"}, "leave out vehicle"),
+        ({"situations": "limits", "trajectories": ("circle",)}, "leave out vehicle"),
         ({"seed": 1000}, "seed"),
         ({"vehicle": "m2"}, "m2-minibus"),
         ({"segment": 0}, "segment"),
@@ -205,6 +220,26 @@ def test_cloning_learns_to_drive(tmp_path: Path) -> None:
     assert spent["steps"] == spent["solves"] >= 6000
     assert spent["seconds"] > 0.0
     assert spent["settings"]["algorithm"] == "bc"
+
+
+def test_a_training_mixes_situations(tmp_path: Path) -> None:
+    settings = mixed()
+    trainer = make_trainer(settings, load_paths(path_names(settings)), Logger(None, []))
+    sizes = [rows.stop - rows.start for rows in trainer.env.rows]
+    shares = [part.share for part in settings.parts]
+    assert sum(sizes) == 61
+    assert all(size // share >= 2 for size, share in zip(sizes, shares, strict=True))
+    for part, task in zip(settings.parts, trainer.env.tasks, strict=True):
+        assert task.vehicle == part.car()
+    assert {task.friction_range for task in trainer.env.tasks} >= {(0.8, 0.8), (0.5, 1.0)}
+    train(settings, tmp_path, SILENT, command="test")
+    policy = read_policy(tmp_path / "policy.json")
+    assert policy.context == tuple(CONTEXT)
+    assert {"m2-minibus", "bmw-320i"} < set(policy.training["vehicle"])
+    assert policy.training["settings"]["situations"] == "limits"
+    own = usual("ppo", start=str(tmp_path / "policy.json"))
+    with pytest.raises(ValueError, match="differs in its context"):
+        make_trainer(own, load_paths(path_names(tiny("ppo")))[:1] * 48, Logger(None, []))
 
 
 def test_ppo_learns_to_drive_from_nothing(tmp_path: Path) -> None:
