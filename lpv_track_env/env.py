@@ -287,6 +287,11 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return 0.5 * sum(self.friction_range)
 
     @property
+    def road_friction(self) -> float:
+        """Friction of tyres and road where the vehicle is, as drawn; inf without a limit."""
+        return plants.road_friction(self._plant, self._conditioned, self._record, self._constants)
+
+    @property
     def actuators(self) -> tuple[float, float]:
         """Acceleration (m/s^2) and steering angle (rad) in force at the actuators."""
         return float(self._record[kernels.ACCELERATION]), float(self._record[kernels.STEERING])

@@ -30,7 +30,7 @@ these: their number stays, until their length is the second."""
 ITERATIONS = 6
 """Largest number of linear programmes."""
 SETTLED = 1e-4
-"""Relative change of a lap's time from which on a closed path needs no further programme."""
+"""Relative gain of a lap's time that is worth a further programme for a closed path."""
 STEERING_MARGIN = 0.96
 """Share of the steering rate that is used."""
 JERK_MARGIN = 0.92
@@ -215,6 +215,8 @@ def _planned(
     )
     smoothed = _smooth(squared, fine * (cells / length), closed=closed)
     planned: Array = np.sqrt(np.minimum(smoothed, limits.max_speed**2))
+    if closed:
+        planned[-1] = planned[0]
     return planned
 
 
@@ -329,6 +331,7 @@ def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: bo
     circle, radius = sparse.csr_matrix((0, m)), np.empty(0)
     if (total := limits.max_total_acceleration) is not None:
         circle, radius = _within_circle(bent, caps, difference, limits, total)
+    fastest = np.inf
     for _ in range(ITERATIONS):
         last = np.maximum(squared, lower)[between]
         # j h b^(-1/2) linearised at b0: j h (1.5 b0^(-1/2) - 0.5 b0^(-3/2) b)
@@ -371,10 +374,12 @@ def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: bo
         if result.x is None:
             raise RuntimeError(f"no speed profile found: {result.message}")
         planned = result.x[:m]
-        before, now = np.sqrt(squared), np.sqrt(planned)
-        squared = planned
-        change_of_time = abs(float((1.0 / now).sum() / (1.0 / before).sum()) - 1.0)
-        if float(np.abs(now - before).max()) < 1e-3 or (closed and change_of_time < SETTLED):
+        time = float((planned**-0.5).sum())
+        if closed and time > (1.0 - SETTLED) * fastest:
+            return planned if time < fastest else squared
+        moved = float(np.abs(np.sqrt(planned) - np.sqrt(squared)).max())
+        squared, fastest = planned, time
+        if moved < 1e-3:
             break
     return squared
 

@@ -49,7 +49,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shared.add_settings(
         parser, "--plan",
         "plan the speed anew: limits of trajectories.SpeedLimits, in SI units, the path's own "
-        "where none is given; grip=0.7 bounds lateral and total acceleration by 0.7 g",
+        "where none is given; grip=0.7 bounds lateral and total acceleration by 0.7 g; "
+        "vehicle=bmw-320i grip=0.7 friction=0.9 plans as the speed mode grip does",
     )  # fmt: skip
     parser.add_argument("--draw", type=file_name, metavar="FILE", help="picture, .png or .svg")
     parser.add_argument("--write", type=file_name, metavar="DIR", help="write native CSV files")
@@ -88,7 +89,8 @@ def limits_of(path: "ReferencePath", given: Mapping[str, Any]) -> "SpeedLimits":
     """Return the limits of a plan: those given by name, and the path's own for the others.
 
     `grip` is a share of g that bounds the lateral acceleration and the total one, so that braking
-    in a turn stays within the friction circle.
+    in a turn stays within the friction circle. With a `vehicle`, and a `friction` if that is not 1,
+    the other limits are not the path's but the vehicle's (`lpv_track_env.reference.grip_limits`).
 
     Raises
     ------
@@ -96,8 +98,11 @@ def limits_of(path: "ReferencePath", given: Mapping[str, Any]) -> "SpeedLimits":
         For an unknown limit, a value that `SpeedLimits` refuses, or one that is missing because the
         path has no limits.
     """
-    from dataclasses import MISSING, fields
+    from dataclasses import MISSING, asdict, fields
 
+    from lpv_track_env.reference import GRIP, ORDINARY_FRICTION, grip_limits
+    from lpv_track_env.tyres import FRICTION
+    from lpv_track_env.vehicle import load
     from trajectories import SpeedLimits
     from trajectories.arguments import Number, shown
     from trajectories.naming import choose
@@ -106,12 +111,17 @@ def limits_of(path: "ReferencePath", given: Mapping[str, Any]) -> "SpeedLimits":
     known = fields(SpeedLimits)
     by_grip = ("max_lateral_acceleration", "max_total_acceleration")
     for key in given:
-        choose("limit in --plan", key, ("grip", *(field.name for field in known)))
-    values = {**path.metadata.get("limits", {}), **given}
+        choose("limit in --plan", key, ("grip", "vehicle", "friction", *(f.name for f in known)))
+    own, given = path.metadata.get("limits", {}), dict(given)
+    friction = FRICTION.of("friction", given.pop("friction", ORDINARY_FRICTION))
+    if "vehicle" in given:
+        grip = GRIP.of("grip", given.pop("grip", None))
+        own = asdict(grip_limits(path, load(given.pop("vehicle")), friction, grip))
+    values = {**own, **given}
     if "grip" in values:
         if both := [name for name in by_grip if name in given]:
             raise ValueError(f"--plan: give grip or {both[0]}, not both")
-        limit = GRAVITY * Number(1e-3, 100.0).of("grip", values.pop("grip"))
+        limit = friction * GRAVITY * Number(1e-3, 100.0).of("grip", values.pop("grip"))
         values |= dict.fromkeys(by_grip, limit)
     needed = [field.name for field in known if field.default is MISSING]
     if missing := [name for name in needed if name not in values]:

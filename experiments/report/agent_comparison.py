@@ -148,9 +148,10 @@ def _tables(document: Document, setting: Setting, rows: Sequence[Row]) -> str:
     tracking = document.table(
         f"Tracking errors in the paper's terms, {setting}.", html_rows(rows, TRACKING, texts)
     )
+    known = [column for column in FURTHER if any(column.key in row.values for row in ours)]
     further = [
         document.table(f"Effort and constraints, {setting}.", html_rows(ours, EFFORT, effort)),
-        document.table(f"Beyond the paper's columns, {setting}.", html_rows(ours, FURTHER, {})),
+        document.table(f"Beyond the paper's columns, {setting}.", html_rows(ours, known, {})),
     ]
     return joined([tracking, folded("Effort, constraints and further figures", joined(further))])
 

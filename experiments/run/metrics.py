@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 
 from experiments.run.rollout import Trace
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, derivative
+from lpv_track_env.reference import ORDINARY_FRICTION
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import CurvatureBands, ReferencePath
 from trajectories.lane_changes import clearance, outline
+from trajectories.speed import GRAVITY
 
 Array = NDArray[np.float64]
 
@@ -245,6 +247,39 @@ def poses(time: Array, state: Array) -> Array:
     return np.vstack([between.swapaxes(0, 1).reshape(-1, 3), values[-1:]]).T
 
 
+def grip(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
+    """Compute the share of grip that the vehicle uses: its acceleration over mu g.
+
+    The acceleration is the vector in the plane of the road, its mean over a control period: the
+    change of the velocity in the world over the period's length. mu is the friction where the
+    period begins, `ORDINARY_FRICTION` where tyres are linear. `grip_used_max` and `grip_used_rms`
+    are the largest share and the root mean square over time.
+    """
+    del path, vehicle
+    if trace.time.size < 2:
+        return {"grip_used_max": 0.0, "grip_used_rms": 0.0}
+    vx, vy, psi = trace.state[:, VX], trace.state[:, VY], trace.state[:, PSI]
+    velocity = (vx + 1j * vy) * np.exp(1j * psi)
+    step = np.diff(trace.time)
+    friction = np.where(trace.friction > 0.0, trace.friction, ORDINARY_FRICTION)[:-1]
+    used = np.abs(np.diff(velocity)) / (step * friction * GRAVITY)
+    return {"grip_used_max": float(used.max()), "grip_used_rms": weighted_rms(step, used)}
+
+
+def lap(trace: Trace, path: ReferencePath, vehicle: VehicleParameters) -> dict[str, float]:
+    """Compute `lap_time`, s, until a closed path was driven once; there is none if it was not.
+
+    The start counts as it is: at the reference's speed unless the case says otherwise.
+    """
+    del vehicle
+    driven = trace.arc_length - trace.arc_length[0]
+    if not path.closed or driven[-1] < path.length:
+        return {}
+    last = int(np.argmax(driven >= path.length))
+    ends = slice(max(last - 1, 0), last + 1)
+    return {"lap_time": float(np.interp(path.length, driven[ends], trace.time[ends]))}
+
+
 METRICS: tuple[Callable[[Trace, ReferencePath, VehicleParameters], dict[str, float]], ...] = (
     tracking,
     by_band,
@@ -253,6 +288,8 @@ METRICS: tuple[Callable[[Trace, ReferencePath, VehicleParameters], dict[str, flo
     knowledge,
     recovery,
     cones,
+    grip,
+    lap,
 )
 """Functions whose entries form a case's `metrics`; add your own here."""
 

@@ -33,7 +33,8 @@ class Trace:
     actuators' values at the end of the period (under ideal conditions, throughout it). `solve_time`
     (s) is the duration of the agent's `predict` call in that period, 0 at the start. `stopping`
     marks periods in which the vehicle braked by itself, `deadline_misses` counts computations that
-    came too late.
+    came too late. `friction` is that of tyres and road where the vehicle is; it is 0 where
+    tyres are linear, since files of traces hold finite numbers alone.
     """
 
     time: Array
@@ -50,6 +51,7 @@ class Trace:
     clipped: Array
     stopping: Array
     deadline_misses: Array
+    friction: Array
 
     def as_dict(self) -> dict[str, Array]:
         """Return the arrays by name."""
@@ -140,6 +142,7 @@ def steps(
                 float(info["clipped"]),
                 float(info.get("stopping", False)),
                 float(info.get("deadline_misses", 0)),
+                _road_friction(inner),
             ]
         )
 
@@ -197,6 +200,12 @@ def steps(
         iterations=np.array(iterations, dtype=float),
         slack=slack,
     )
+
+
+def _road_friction(env: Any) -> float:
+    """Return the friction where an environment's vehicle is, as traces hold it."""
+    friction: float = getattr(env, "road_friction", math.inf)
+    return friction if friction < math.inf else 0.0
 
 
 class _Driver:

@@ -208,6 +208,9 @@ FURTHER = (
     Column("deadline_misses", "deadline misses", "", 1),
     Column("stopping_share", "share braking by itself", "", 3),
     Column("duration", "duration", "s", 1),
+    Column("lap_time", "lap time", "s", 2),
+    Column("grip_used_max", "largest share of grip", "", 2),
+    Column("grip_used_rms", "rms share of grip", "", 2),
 )
 """Further columns; "by the clock" is the distance to the reference's position at the time."""
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from lpv_track_env import kernels
 from lpv_track_env.conditions import Conditions
 from lpv_track_env.conditions import episode as conditions_episode
-from lpv_track_env.conditions.layout import FRICTION, STRETCH_FACTOR
+from lpv_track_env.conditions.layout import FRICTION, STRETCH_FACTOR, ConditionedVehicle
 from lpv_track_env.conditions.vehicle import slipperiness
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.naming import choose
@@ -139,6 +139,20 @@ def friction_range(
     """Return the least and largest friction of tyres and road, inf without a limit."""
     given = (math.inf,) * 2 if conditions is None else conditions.ends("friction")
     return given if plant is None else plant.friction_range(*given)
+
+
+def road_friction(
+    plant: "PlantEpisode | None",
+    conditioned: ConditionedVehicle | None,
+    record: Array,
+    constants: Array,
+) -> float:
+    """Return the friction of tyres and road where a vehicle is, as drawn; inf without a limit."""
+    drawn, factor = math.inf, 1.0
+    if conditioned is not None:
+        drawn = float(conditioned.vehicle[FRICTION])
+        factor = float(slipperiness(record, conditioned.spec, constants))
+    return factor * (drawn if plant is None else plant.friction_range(drawn, drawn)[0])
 
 
 class PlantEpisode:

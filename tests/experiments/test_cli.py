@@ -560,6 +560,23 @@ def test_a_plan_is_written_and_driven_as_it_is(
     assert "not both" in refused(capsys, "trajectories", "T2", "--plan", *both)
 
 
+def test_a_plan_for_a_vehicle_is_the_one_it_is_driven_at(tmp_path: Path) -> None:
+    """`--plan vehicle=...` writes the profile of the speed mode grip."""
+    plan = ["--plan", "vehicle=bmw-320i", "grip=0.6", "friction=0.8"]
+    assert main(["trajectories", "T4", *plan, "--write", str(tmp_path)]) == 0
+    speed = ["--grip", "0.6", "--conditions", "ideal", "--conditions-set", "friction=0.8"]
+    command = ["benchmark", "--agents", "stanley", "--vehicles", "bmw-320i", "--trajectories", "T4"]
+    assert main([*command, *speed, "--workers", "1", "--out", str(tmp_path / "out")]) == 0
+    (case,) = ResultStore(tmp_path / "out").cases()
+    assert (case["speed_mode"], case["grip"], case["end"]) == ("grip", 0.6, "finished")
+    assert 0.5 < case["metrics"]["grip_used_max"] < 0.7
+    trace = ResultStore(tmp_path / "out").trace(case["id"])
+    assert trace is not None
+    assert set(trace["friction"]) == {0.8}
+    wanted = trajectories.load(tmp_path / "T4.csv").sample(trace["arc_length"]).speed
+    np.testing.assert_allclose(trace["reference_speed"], wanted, atol=1e-9)
+
+
 def test_the_published_rows_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["trajectories", "T2", "T4-raw"]) == 0
     lines = capsys.readouterr().out.splitlines()

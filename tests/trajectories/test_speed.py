@@ -2,6 +2,10 @@
 
 import dataclasses
 import math
+import time
+import warnings
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +13,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from trajectories import ReferencePath, SpeedLimits, load, plan_speed
+from trajectories import speed as speed_module
 from trajectories.path import SPACING
-from trajectories.speed import speed_caps
+from trajectories.speed import replanned, speed_caps
 
 LIMITS = SpeedLimits(max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5)
 NAMES = (
@@ -23,8 +28,16 @@ def limits_used(path: ReferencePath) -> SpeedLimits:
     return SpeedLimits(**path.metadata["limits"])
 
 
-def cells(speed: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Acceleration (n - 1,) of every cell and jerk v da/ds (n - 2,) at every inner node."""
+SHARED = Path(__file__).parents[3] / "shared"
+
+
+def cells(
+    speed: np.ndarray, spacing: float, *, closed: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Acceleration of every cell and jerk v da/ds at every node between two, over the seam, too."""
+    if closed:
+        assert speed[0] == speed[-1]
+        speed = np.append(speed, speed[1])
     acceleration = np.diff(speed**2) / (2 * spacing)
     return acceleration, speed[1:-1] * np.diff(acceleration) / spacing
 
@@ -54,15 +67,115 @@ def test_open_profile_starts_and_ends_at_the_end_speed(name: str) -> None:
     assert path.speed[-1] == pytest.approx(limits_used(path).end_speed, abs=1e-9)
 
 
+def check_limits(path: ReferencePath, limits: SpeedLimits) -> None:
+    """Check every limit of a closed path by differences, the seam included."""
+    acceleration, jerk = cells(path.speed, path.spacing, closed=True)
+    assert acceleration.max() <= limits.max_acceleration + 1e-6
+    assert acceleration.min() >= -limits.deceleration - 1e-6
+    assert np.abs(jerk).max() <= 1.02 * limits.max_jerk
+    assert path.speed.max() <= limits.max_speed
+    lateral = path.speed**2 * np.abs(path.curvature)
+    assert lateral.max() <= 1.005 * limits.max_lateral_acceleration
+    steering = np.arctan(limits.wheelbase * np.append(path.curvature, path.curvature[1]))
+    rate = path.speed[1:] * np.abs(steering[2:] - steering[:-2]) / (2.0 * path.spacing)
+    # A kink never stops the profile: it is passed at the least speed.
+    assert rate[path.speed[1:] > 1.05 * limits.min_speed].max() <= 1.02 * limits.max_steering_rate
+    if (total := limits.max_total_acceleration) is not None:
+        beside = np.maximum(lateral[1:], lateral[:-1])
+        assert np.hypot(acceleration[:-1], beside).max() <= 1.005 * total
+
+
 def test_closed_profile_goes_on_over_the_seam() -> None:
     path = load("figure-eight")
+    check_limits(path, limits_used(path))
+
+
+@pytest.mark.parametrize("name", ["Austin", "Budapest", "Norisring", "Spielberg", "Suzuka"])
+def test_limits_hold_all_along_a_racetrack(name: str) -> None:
+    file = SHARED / "tracks" / f"{name}.csv"
+    if not file.exists():
+        pytest.skip(f"{file} is not there")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        path = load(file)
+    check_limits(path, limits_used(path))
+    began = time.perf_counter()
+    fast = SpeedLimits(
+        50.0, 9.0, 4.0, 8.0, max_jerk=20.0, wheelbase=2.6, max_total_acceleration=9.0
+    )
+    faster = replanned(path, fast)
+    assert time.perf_counter() - began < 10.0
+    check_limits(faster, fast)
+    assert faster.duration < 0.5 * path.duration
+
+
+def test_a_seam_at_a_kink_keeps_the_limits() -> None:
+    file = SHARED / "cases" / "60_seam_acceleration.csv"
+    if not file.exists():
+        pytest.skip(f"{file} is not there")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        path = load(file)
     limits = limits_used(path)
-    assert path.speed[0] == path.speed[-1]
-    around = np.concatenate([path.speed[-9:-1], path.speed[:9]])
-    acceleration, jerk = cells(around, path.spacing)
-    assert np.abs(acceleration).max() <= limits.max_acceleration + 1e-6
-    # The middle of three laps is periodic only as far as the outer ones settle.
-    assert np.abs(jerk).max() <= 1.05 * limits.max_jerk
+    acceleration, _ = cells(path.speed, path.spacing, closed=True)
+    assert acceleration.max() <= limits.max_acceleration + 1e-6
+    assert acceleration.min() >= -limits.deceleration - 1e-6
+
+
+@pytest.mark.parametrize("start", [100, 640, 1279])
+def test_where_a_lap_begins_changes_nothing(start: int) -> None:
+    """Begin at any of the grid's nodes, every fourth of the path's: the same lap from there."""
+    s = np.arange(1280) * SPACING
+    curvature = 0.05 * np.sin(2.0 * np.pi * s / 320.0) ** 3 + 0.02
+    limits = dataclasses.replace(LIMITS, max_total_acceleration=2.0)
+    start -= start % 4
+    lap, other = (
+        plan_speed(np.append(given, given[0]), SPACING, limits, closed=True)[:-1]
+        for given in (curvature, np.roll(curvature, -start))
+    )
+    assert lap.std() > 0.5
+    np.testing.assert_allclose(other, np.roll(lap, -start), atol=1e-3)
+
+
+def test_an_oval_has_the_bang_bang_profile() -> None:
+    """Two straights of 400 m between bends of 25 m radius, with a jerk that does not matter."""
+    limits = SpeedLimits(60.0, 4.0, 2.0, 5.0, max_jerk=1e4, max_steering_rate=1e4)
+    bend = 4 * round(np.pi * 25.0)  # nodes; half a lap is a whole number of cells
+    half = np.concatenate([np.full(bend, 1 / 25.0), np.zeros(1600)])
+    speed = plan_speed(np.append(np.tile(half, 2), half[0]), SPACING, limits, closed=True)
+    np.testing.assert_allclose(speed[bend // 2], 10.0, rtol=1e-9)
+    np.testing.assert_allclose(speed[: len(half)], speed[len(half) : -1], atol=1e-6)
+    along = np.arange(1600) * SPACING
+    expected = np.minimum(100.0 + 4.0 * along, 100.0 + 10.0 * (400.0 - along))
+    # A node takes the lowest cap within half a cell, and the spline rounds the corner on top.
+    apart = speed[bend : len(half)] ** 2 - expected
+    assert np.abs(apart).max() <= 2.0 * (2.0 + 5.0)
+    top = 100.0 + 4.0 * 400.0 * 5.0 / 7.0
+    assert speed.max() ** 2 == pytest.approx(top, rel=0.01)
+
+
+def test_a_long_lap_is_planned_at_once_and_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[int] = []
+    solve = speed_module.linprog
+
+    def counted(cost: Any, **more: Any) -> Any:
+        sizes.append(len(cost) // 2)
+        return solve(cost, **more)
+
+    monkeypatch.setattr(speed_module, "linprog", counted)
+    curvature = np.where(np.arange(24_001) % 4000 < 100, 0.1, 0.001)
+    curvature[-1] = curvature[0]
+    limits = dataclasses.replace(LIMITS, max_speed=10.5)
+    speed = plan_speed(curvature, SPACING, limits, closed=True)
+    assert set(sizes) == {3000}  # for 6000 m
+    assert len(sizes) <= 3
+    # A sixth of the lap, five times again.
+    np.testing.assert_allclose(speed[:4000], speed[8000:12_000], atol=1e-2)
+    again = plan_speed(curvature.copy(), SPACING, limits, closed=True)
+    assert len(sizes) <= 3
+    np.testing.assert_array_equal(again, speed)
+    again[:] = 0.0  # the caller's own copy
+    np.testing.assert_array_equal(plan_speed(curvature, SPACING, limits, closed=True), speed)
 
 
 def test_circle_is_driven_at_its_lateral_limit() -> None:
@@ -200,7 +313,7 @@ def test_any_curvature_gets_a_profile_that_keeps_its_limits(
     assert np.isfinite(speed).all()
     assert speed.min() > 0.3
     assert speed.max() <= top
-    acceleration, jerk = cells(speed, SPACING)
+    acceleration, jerk = cells(speed, SPACING, closed=closed)
     assert acceleration.max() <= longitudinal + 1e-6
     assert acceleration.min() >= -limits.deceleration - 1e-6
     assert np.abs(jerk).max() <= 1.05 * limits.max_jerk

@@ -7,10 +7,11 @@ import pytest
 
 from agents.weights import TrackingWeights, WeightSchedule
 from experiments.cli import main, parser
-from experiments.commands.options import agent_settings
+from experiments.commands.options import agent_settings, speed_modes_of
 from experiments.run import tables
 from experiments.run.case import Case
 from experiments.run.store import ResultStore
+from experiments.run.suites import grid
 from trajectories import CurvatureBands
 
 WEIGHTS = {"Q": [1, 1, 20, 20], "S": [5, 5, 100, 100], "R": [0.01, 1]}
@@ -158,7 +159,28 @@ def test_rows_of_one_agent_with_other_settings_are_told_apart(tmp_path: Path) ->
         (["benchmark", "--traj=T1"], "trajectories", ["T1"]),
         (["benchmark", "--speed", "fixed"], "speed_modes", ["fixed"]),
         (["highway", "--env", "--agent-set"], "agent_set", []),
+        (["benchmark", "--grip", "0.5", "0.9"], "grip", [0.5, 0.9]),
     ],
 )
 def test_short_forms_of_options(given: list[str], name: str, values: list[str]) -> None:
     assert getattr(parser(given[:1]).parse_args(given), name) == values
+
+
+def test_shares_of_grip_are_driven_in_the_mode_of_that_name() -> None:
+    def modes(*given: str) -> list[str]:
+        return speed_modes_of(parser(["benchmark"]).parse_args(["benchmark", *given]))
+
+    assert modes() == []
+    assert modes("--grip", "0.5") == ["grip"]
+    assert modes("--speed-modes", "fixed", "grip", "--grip", "0.5") == ["fixed", "grip"]
+    for alone in (["--speed-modes", "grip"], ["--speed-modes", "fixed", "--grip", "0.5"]):
+        with pytest.raises(ValueError, match="belong together"):
+            modes(*alone)
+    specs = grid(["pid"], ["T1"], speed_modes=("variable", "grip"), grips=(0.5, 0.9))
+    assert [(spec["speed_mode"], spec.get("grip")) for spec in specs] == [
+        ("variable", None), ("grip", 0.5), ("grip", 0.9),
+    ]  # fmt: skip
+    titles = [str(tables.setting_of(Case(**spec).as_dict())) for spec in specs]
+    assert titles == [
+        "m2-minibus · variable speed", "m2-minibus · 0.5 of grip", "m2-minibus · 0.9 of grip",
+    ]  # fmt: skip

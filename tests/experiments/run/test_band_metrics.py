@@ -37,7 +37,7 @@ def episode(time, arc_length, lateral, heading=0.0):
     zero = np.zeros(n)
     rest = dict.fromkeys(
         ("reference_speed", "acceleration", "steering_angle", "solve_time", "reward", "clipped",
-         "stopping", "deadline_misses"), zero,
+         "stopping", "deadline_misses", "friction"), zero,
     )  # fmt: skip
     return Trace(
         time=np.asarray(time, dtype=float),

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from experiments.run import metrics
 from experiments.run.rollout import Trace
 from lpv_track_env import vehicle
-from lpv_track_env.bicycle import derivative
+from lpv_track_env.bicycle import VX, derivative
 from trajectories import ReferencePath, load
 from trajectories.lane_changes import clearance, outline
 
@@ -51,6 +51,7 @@ def episode(arc_length, lateral=0.0, heading=0.0, period=0.1, **changes):
         "clipped": full(0.0),
         "stopping": full(0.0),
         "deadline_misses": full(0.0),
+        "friction": full(0.0),
     }
     return Trace(**{**arrays, **changes})
 
@@ -326,3 +327,44 @@ def test_cones_are_measured_between_the_states_too():
     assert values["cone_clearance"] == pytest.approx(exact, abs=0.03)
     assert clearance(path.metadata["cones"], *state[:, [4, 5, 2]].T, corners) == math.inf
     assert "cone_clearance" not in metrics.evaluate(drive(), straight(), CAR)
+
+
+def on_a_circle(radius: float, speed: float, friction: float, seconds: float = 40.0) -> Trace:
+    """A trace at constant speed on a circle, at 20 Hz."""
+    time = np.arange(0.0, seconds, 0.05)
+    trace = episode(speed * time, period=0.05)
+    rate, full = speed / radius, np.ones_like(time)
+    state = np.column_stack(
+        [speed * full, 0.0 * full, rate * time, rate * full, 0.0 * full, 0.0 * full]
+    )
+    return replace(trace, state=state, friction=friction * full)
+
+
+@pytest.mark.parametrize("friction", [0.5, 0.0])
+def test_grip_used_on_a_circle_is_v_squared_over_r_mu_g(friction):
+    used = metrics.grip(on_a_circle(30.0, 10.0, friction), straight(), CAR)
+    mu = friction or 1.0
+    # The chord of a velocity that turns by 1/60 rad in a period is shorter than its arc.
+    expected = 100.0 / 30.0 / (mu * 9.81) * np.sinc(1.0 / 120.0 / np.pi)
+    assert used["grip_used_max"] == pytest.approx(expected, rel=1e-9)
+    assert used["grip_used_rms"] == pytest.approx(expected, rel=1e-9)
+
+
+def test_grip_used_by_braking_where_the_road_is_slippery():
+    trace = drive(n=3)
+    state = trace.state.copy()
+    state[:, VX] = [10.0, 9.8, 9.8]  # 2 m/s^2 at first
+    trace = replace(trace, state=state, friction=np.array([0.4, 1.0, 1.0]))
+    used = metrics.grip(trace, straight(), CAR)
+    assert used["grip_used_max"] == pytest.approx(2.0 / (0.4 * 9.81))
+    assert used["grip_used_rms"] == pytest.approx(2.0 / (0.4 * 9.81) / np.sqrt(2.0))
+
+
+def test_a_lap_ends_between_two_samples():
+    circle = load("circle")
+    trace = on_a_circle(30.0, 10.0, 1.0)
+    begun = replace(trace, arc_length=trace.arc_length + 50.0)
+    lap = metrics.lap(begun, circle, CAR)["lap_time"]
+    assert lap == pytest.approx(circle.length / 10.0, abs=1e-9)
+    assert metrics.lap(trace, straight(), CAR) == {}
+    assert metrics.lap(on_a_circle(30.0, 10.0, 1.0, 18.0), circle, CAR) == {}
