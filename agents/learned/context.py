@@ -1,7 +1,8 @@
 """Context of a policy: constants of the task, for one network that drives many vehicles.
 
 Its values follow the observation as further inputs of the features. They do not change while an
-agent drives, so `with_context` adds what they contribute to the features' bias, once.
+agent drives, so `with_context` adds what they contribute to the features' bias, once. Increments of
+the actuators' values are then shares of what the vehicle's own rates allow.
 """
 
 from collections.abc import Callable, Mapping
@@ -60,6 +61,10 @@ class Features(Protocol):
         """(features,)."""
 
     @property
+    def origin(self) -> str:
+        """Origin of the actions."""
+
+    @property
     def context(self) -> tuple[str, ...]:
         """Names in `CONTEXT`."""
 
@@ -72,14 +77,24 @@ def context_of(names: tuple[str, ...], task: DrivingTask) -> NDArray[np.float64]
     return np.array([CONTEXT[name](task) for name in names])
 
 
+def increments(task: DrivingTask) -> NDArray[np.float64]:
+    """Return the largest changes of the actuators in a control period, (2,) [m/s^2, rad]."""
+    car = task.vehicle
+    return np.array([car.max_jerk, car.max_steering_rate]) * task.control_period
+
+
 def with_context(scaled: Scaled, task: DrivingTask) -> Scaled:
-    """Return the same scaling for a task: without context, but with its values in the bias."""
+    """Return the same scaling for a task: without context, but with its values in the bias.
+
+    With origin "actuators", half the range of the actions becomes the vehicle's `increments`.
+    """
     if not scaled.context:
         return scaled
+    half = {"half": increments(task)} if scaled.origin == "actuators" else {}
     weight = scaled.feature_weight.astype(np.float64)
     inputs = weight.shape[1] - len(scaled.context)
     bias = scaled.feature_bias + weight[:, inputs:] @ context_of(scaled.context, task)
     return replace(  # type: ignore[type-var]
         scaled, feature_weight=scaled.feature_weight[:, :inputs],
-        feature_bias=bias.astype(np.float32), context=(),
+        feature_bias=bias.astype(np.float32), context=(), **half,
     )  # fmt: skip

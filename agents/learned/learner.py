@@ -14,12 +14,11 @@ from scipy.linalg import block_diag
 
 from agents.base import DrivingTask
 from agents.delay import DelayMemory, NearFuture
-from agents.learned.context import with_context
+from agents.learned.context import increments, with_context
 from agents.learned.policy import ORIGINS, Origin, Policy
 from agents.learned.sb3_policies import network_of
 from agents.sb3 import AdapterVecEnv, TrackingVecEnv
 from lpv_track_env.observation import ACCELERATION, PREVIEW_BOUNDS, SCALARS, STEERING_ANGLE
-from lpv_track_env.vehicle import VehicleParameters
 from trajectories.naming import choose
 
 Array = NDArray[Any]
@@ -53,7 +52,8 @@ class Scaling:
     half: NDArray[np.float64]
     """(2,) [m/s^2, rad]."""
     context: tuple[str, ...] = ()
-    """Names of the task's constants that follow, of `agents.learned.context.CONTEXT`."""
+    """Names of the task's constants that follow, of `agents.learned.context.CONTEXT`; with it and
+    origin "actuators", the vehicle's rates replace `half`."""
 
     @property
     def features(self) -> int:
@@ -121,18 +121,18 @@ def usual_scaling(
     bias[len(bias) - len(context) :] = -scales * middles
     return Scaling(
         weight.astype(np.float32), bias, LIMIT, origin,
-        *_outputs(car, task.control_period, origin), context,
+        *_outputs(task, origin), context,
     )  # fmt: skip
 
 
-def _outputs(car: VehicleParameters, period: float, origin: str) -> tuple[Array, Array]:
+def _outputs(task: DrivingTask, origin: str) -> tuple[Array, Array]:
     """Return centre and half width of the action range, (2,) [m/s^2, rad] each."""
-    low, high = car.acceleration_range
-    whole = np.array([0.5 * (high - low), car.max_steering_angle])
+    low, high = task.vehicle.acceleration_range
+    whole = np.array([0.5 * (high - low), task.vehicle.max_steering_angle])
     if origin == "zero":
         return np.array([0.5 * (low + high), 0.0]), whole
     if origin == "actuators":
-        return np.zeros(2), np.array([car.max_jerk, car.max_steering_rate]) * period
+        return np.zeros(2), increments(task)
     return np.zeros(2), RESIDUAL_SHARE * whole
 
 
@@ -290,6 +290,15 @@ class LearnerVecEnv(AdapterVecEnv):
     def origins(self) -> NDArray[np.float64]:
         """Origins of the next actions, (n, 2) [m/s^2, rad]."""
         return np.concatenate([part.origins for part in self._parts])
+
+    @property
+    def halves(self) -> NDArray[np.float64]:
+        """Half the range of each environment's actions, (n, 2) [m/s^2, rad]."""
+        return np.repeat(
+            [part.scaling.half for part in self._parts],
+            [part.venv.num_envs for part in self._parts],
+            axis=0,
+        )
 
     def policy_of(
         self, model: Any, algorithm: str, training: Mapping[str, Any] | None = None

@@ -96,6 +96,7 @@ class Policy:
         observation as u: the policy then treats left and right alike.
     context
         Names of the task's constants that the features see, of `agents.learned.context.CONTEXT`.
+        With it and origin "actuators", the vehicle's rates replace `half`.
 
     Raises
     ------

@@ -90,7 +90,7 @@ class CloningTrainer(Trainer):
             seen, scaling = self.env.agent_observations, self.env.scaling
             for k, (expert, rows) in enumerate(zip(self._experts, self.env.rows, strict=True)):
                 actions[rows], memories[k] = expert.predict(seen[rows], memories[k], starts[rows])
-            wanted = (actions - self.env.origins - scaling.centre) / scaling.half
+            wanted = (actions - self.env.origins - scaling.centre) / self.env.halves
             wanted = np.clip(wanted, -1.0, 1.0).astype(np.float32)
             inputs.append(features)
             labels.append(wanted)

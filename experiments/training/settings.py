@@ -72,6 +72,10 @@ With 0.05 m, PPO ends at twice the error in simulation; with 0.02 m it takes lon
 road at first.
 """
 
+LIMITS_REWARD = {**REWARD, "lateral": 0.4, "lateral_scale": 0.05, "end": 100.0}
+"""The same for situations far beside the path, from where it must pay to come back: seconds with an
+error of some metres cost less than to leave the corridor."""
+
 FAST: dict[str, Any] = {
     "conditions": ("simulation",), "steps": 5_000_000, "reward": {**REWARD, "lateral_scale": 0.05},
     "hyperparameters": {"batch": 2048, "epochs": 2},
@@ -215,8 +219,10 @@ def usual(algorithm: str, **changes: Any) -> TrainingSettings:
     choose("algorithm", algorithm, ALGORITHMS)
     given = {key: value for key, value in changes.items() if value is not None}
     steps = given.get("steps", STEPS[algorithm])
+    rewards = {} if given.get("situations", USUAL) == USUAL else {"reward": LIMITS_REWARD}
     usual_values = {
-        "steps": steps, "envs": ENVS[algorithm], "segment": min(SEGMENTS[algorithm], max(steps, 1)),
+        "steps": steps, "envs": ENVS[algorithm],
+        "segment": min(SEGMENTS[algorithm], max(steps, 1)), **rewards,
     }  # fmt: skip
     return TrainingSettings(algorithm, **{**usual_values, **given})
 

@@ -53,21 +53,23 @@ class Situation:
 
 
 _UNKNOWN = {"name": "realtime", "friction": [0.5, 1.0]}
+_SLIPPERY = {"name": "realtime", "friction": [0.5, 0.65]}
 _MINIBUS, _BMW = "m2-minibus", "bmw-320i"
 SITUATIONS: dict[str, tuple[Situation, ...]] = {
     "limits": (
         Situation(_MINIBUS, share=3),
         Situation(_MINIBUS, "realtime", share=3),
         Situation(_MINIBUS, share=4, errors=FAR),
-        Situation(_MINIBUS, "realtime", share=2, limit=True),
+        Situation(_MINIBUS, "realtime", share=4, limit=True),
         Situation(
-            _MINIBUS, "realtime", changes={"max_steering_rate": 0.15, "max_jerk": 1.5}
+            _MINIBUS, "realtime", share=2, changes={"max_steering_rate": 0.15, "max_jerk": 1.5}
         ),
         Situation(_BMW),
         Situation(_BMW, {"name": "ideal", "friction": 1.05}, share=3, limit=True),
         Situation(_BMW, {"name": "ideal", "friction": 0.8}, share=2, limit=True),
-        Situation(_BMW, _UNKNOWN, share=4, limit=True),
-        Situation(_BMW, {**_UNKNOWN, "estimator": "truth"}, share=2, limit=True),
+        Situation(_BMW, _UNKNOWN, share=3, limit=True),
+        Situation(_BMW, _SLIPPERY, share=3, limit=True),
+        Situation(_BMW, {**_SLIPPERY, "estimator": "truth"}, share=2, limit=True),
         Situation("course-car"),
         Situation("ford-escort"),
         Situation("vw-vanagon"),

@@ -16,7 +16,7 @@ import lpv_track_env  # noqa: F401  registers the environments
 from agents.base import DrivingTask
 from agents.learned import Policy, read, write
 from agents.learned.agent import LearnedPolicy
-from agents.learned.context import CONTEXT, context_of, with_context
+from agents.learned.context import CONTEXT, context_of, increments, with_context
 from agents.learned.learner import CONTEXT_SCALES, LearnerVecEnv, usual_scaling
 from experiments.run.case import run_case
 from lpv_track_env import PATH_TRACKING
@@ -69,6 +69,10 @@ def test_the_context_is_a_further_input(
         base = np.random.default_rng(1).normal(size=(20, 2))
         seen = np.hstack([rows, base])
     seen = np.hstack([seen, np.tile(context_of(NAMES, here), (20, 1))])
+    if origin == "actuators":
+        assert folded.half.tolist() == increments(here).tolist()
+        assert abs(policy.half - folded.half).max() > 0.1
+        policy = dataclasses.replace(policy, half=folded.half)
     expected = plain_act(policy, seen, base)
     if symmetric:
         turned = plain_act(policy, seen * policy.mirror, base * [1.0, -1.0]) * [1.0, -1.0]
