@@ -16,6 +16,7 @@ COMMANDS = {
     "report": "Rebuild the table and report.html from saved cases alone.",
     "drive": "Watch a run live, or write its frames or a video; several agents side by side.",
     "trajectories": "Print published against achieved rows of the six trajectories and draw them.",
+    "limits": "Compute the physical limits of lane changes and laps by optimal control.",
     "speed": "Measure how fast the environments and the solvers are, against their peers.",
     "ablation": "Drive with each disturbance of a real vehicle alone, with and without "
     "compensation.",
