@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.report.drives import LEAD, family_of, main_family, per_setting
 from experiments.report.page import Cell, Document, html_table, joined, paragraph
-from experiments.run import regimes, tables
+from experiments.run import ranking, regimes, tables
 from experiments.run.console_tables import (
     KEY_FIGURES,
     against_published,
@@ -74,11 +74,18 @@ def regime_section(document: Document, cases: Sequence[Result]) -> str:
         return ""
     labels = tables.labels(case for case in cases if case.get("regime"))
     overview = [[name, *_overview(found, labels)] for name, found in groups.items()]
+    ranked = [line.cells for line in ranking.ranking(cases)]
     return joined(
         [
+            document.table(
+                "Ranking of the agents.",
+                html_table(ranking.HEADINGS, ranked, range(1, len(ranking.HEADINGS))),
+            ),
+            paragraph(ranking.NOTE),
             paragraph(regimes.NOTE),
             document.table(
-                "Failed drives of all drives, and below them MLE (m) of those that finished.",
+                "Failed drives of all drives, and below them the first figure of those that "
+                "finished: MLE, m; from a start ALE, m; entry speed, m/s; fastest lap, s.",
                 html_table(("regime", *labels), overview, range(1, len(labels) + 1), (0,)),
             ),
             *(
@@ -100,7 +107,9 @@ def _overview(found: Sequence[regimes.Line], labels: Sequence[str]) -> list[Cell
     """Return a cell for each agent: its failures, and its MLE in small print."""
     own = {line.label: line for line in found}
     return [
-        (f"{line.failed} of {line.drives}", line.cells[3]) if (line := own.get(label)) else "–"
+        (f"{line.failed} of {line.drives}", line.cells[len(regimes.COUNTS)])
+        if (line := own.get(label))
+        else "–"
         for label in labels
     ]
 

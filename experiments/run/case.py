@@ -9,7 +9,7 @@ import time
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from experiments.run.provenance import (
 )
 from experiments.run.result_schema import as_stored
 from experiments.run.rollout import Rollout, rollout
+from experiments.run.search import Search
 from lpv_track_env import conditions, plants, vehicle
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.reference import SpeedChoice, reference
@@ -162,7 +163,9 @@ class Case(BaseCase):
     (say, a wider `max_lateral_velocity_ratio`); `agent_settings` and `env_settings` are keyword
     arguments of the agent's class and of the environment. `regime` names what a case is meant to
     try, such as "slow actuators": tables put the cases of a regime together. `start` holds reset
-    options that say where the vehicle starts: any of `lpv_track_env.episodes.GIVEN`.
+    options that say where the vehicle starts: any of `lpv_track_env.episodes.GIVEN`. `search` asks
+    for the highest value of a setting with which the agent passes: the arguments of
+    `experiments.run.search.Search`. The result is then that of the drive with that value.
     """
 
     agent: str
@@ -180,6 +183,7 @@ class Case(BaseCase):
     regime: str = ""
     start: Mapping[str, float] = field(default_factory=dict)
     grip: float | None = None
+    search: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def reset_options(self) -> dict[str, Any]:
@@ -217,6 +221,8 @@ class Case(BaseCase):
         for key in self.env_settings:
             choose("environment setting", key, keyword_settings(PathTrackingEnv))
         self.resolved_env_settings()
+        for case in self._ends_of_search():
+            case.check()
         for key in self.vehicle_changes:
             choose("vehicle field", key, VEHICLE_FIELDS)
         car = self.make_vehicle()
@@ -225,6 +231,25 @@ class Case(BaseCase):
         if self.start:
             path = reference(self.trajectory, car, speed, plant, given)
             check_start(checked_start(self.start, path.length), path, car)
+
+    def _with(self, setting: str, value: float) -> "Case":
+        """Return the case of a single drive of a search."""
+        return replace(self, search={}, **{setting: value})
+
+    def _ends_of_search(self) -> list["Case"]:
+        """Return the cases of a search's lowest and highest value; none without a search.
+
+        Raises
+        ------
+        ValueError
+            If the case has a value of the setting already, or as `Search`.
+        """
+        if not self.search:
+            return []
+        wanted = Search(**self.search)
+        if getattr(self, wanted.setting) is not None:
+            raise ValueError(f"give {wanted.setting} or a search for its highest value, not both")
+        return [self._with(wanted.setting, wanted.value(k)) for k in (0, wanted.last)]
 
     def packages(self) -> tuple[str, ...]:
         """Return the packages that compute a result."""
@@ -278,8 +303,21 @@ class Case(BaseCase):
 
         Added are `end`, `metrics`, `solver` (median, p99, max time in s; failures), `warnings`, and
         `trace`, arrays by name; for a learned policy `training`, the cost of making it
-        (`experiments.run.learning_cost`); with computing times `latency`.
+        (`experiments.run.learning_cost`); with computing times `latency`; after a search `tried`.
         """
+        if self.search:
+            wanted = Search(**self.search)
+
+            def attempt(value: float) -> dict[str, Any]:
+                one: dict[str, Any] = {}
+                self._with(wanted.setting, value).drive(one)
+                return one
+
+            result |= wanted.run(attempt)
+        else:
+            self._drive_once(result)
+
+    def _drive_once(self, result: dict[str, Any]) -> None:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             env = self.make_env()
@@ -318,7 +356,7 @@ def project_digest() -> str:
     packages = (trajectories, lpv_track_env, agents)
     folders = [Path(str(package.__file__)).parent for package in packages]
     here = Path(__file__).parent
-    names = ("case", "rollout", "metrics", "computing", "learning_cost", "traffic")
+    names = ("case", "rollout", "metrics", "computing", "learning_cost", "search", "traffic")
     own = "".join((here / f"{name}.py").read_text() for name in names)
     return hashlib.sha256((source_digest(*folders) + own).encode()).hexdigest()[:16]
 

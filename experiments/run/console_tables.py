@@ -11,7 +11,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from experiments.run import regimes
+from experiments.run import ranking, regimes
 from experiments.run.learning_cost import words
 from experiments.run.metrics import BANDS, PAPER_SIMULATION, published_row
 from experiments.run.tables import (
@@ -180,8 +180,7 @@ def all_tables(cases: Iterable[Result]) -> RenderableType:
     """
     kept = ordered(current(cases))
     groups = cases_by_setting(kept)
-    found = regimes.table(kept)
-    parts: list[RenderableType] = [] if found is None else [found]
+    parts: list[RenderableType] = [*by_regime(kept)]
     for setting, rows in by_setting(build_rows(kept)).items():
         parts += [_tracking(str(setting), rows), _effort(rows)]
         if (curvature := _curvature(groups[setting])) is not None:
@@ -194,6 +193,20 @@ def all_tables(cases: Iterable[Result]) -> RenderableType:
     return Group(*parts, *learning, Text(PUBLISHED_NOTE, style="dim"))
 
 
+def by_regime(cases: Sequence[Result]) -> list[RenderableType]:
+    """Return the ranking of the agents, the tables of all regimes and a note; none without any."""
+    found = regimes.tables_of(cases)
+    if not found:
+        return []
+    ranked = _start("Ranking")
+    for place, heading in enumerate(ranking.HEADINGS):
+        ranked.add_column(heading.replace(" ", "\n"), justify="right" if place else "left")
+    for line in ranking.ranking(cases):
+        ranked.add_row(*map(Text, line.cells))
+    notes = [Text(words, style="dim") for words in (ranking.NOTE, regimes.NOTE)]
+    return [ranked, notes[0], Text(), Text("By regime", style="bold"), *found, notes[1]]
+
+
 def screen(cases: Iterable[Result]) -> tuple[RenderableType, bool]:
     """Return tables that fit on a screen, and whether they are all there are.
 
@@ -202,8 +215,8 @@ def screen(cases: Iterable[Result]) -> tuple[RenderableType, bool]:
     from it only in its conditions.
     """
     kept = ordered(current(cases))
-    if (found := regimes.table(kept)) is not None:
-        return found, False
+    if found := by_regime(kept):
+        return Group(*found), False
     rows = [row for row in build_rows(kept) if not row.published]
     if len(rows) <= SCREEN:
         return all_tables(kept), True

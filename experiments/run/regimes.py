@@ -12,6 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from agents.weight_tuning.score import SCALES
+from experiments import limits
+from experiments.run.search import passes
+from experiments.run.statistics import rate_interval
 from experiments.run.tables import Result, by_label, ordered
 
 
@@ -21,9 +24,11 @@ class Mean(NamedTuple):
     heading: str
     key: str
     decimals: int
+    factor: float = 1.0
 
 
 SCORE = Mean("score", "score", 2)
+POSSIBLE = Mean("of possible, %", "of_possible", 0, 100.0)
 MEANS = (
     Mean("MLE, m", "mle", 3),
     Mean("ALE, m", "ale", 3),
@@ -34,20 +39,31 @@ MEANS = (
 )
 """Columns of a regime's table after `COUNTS`."""
 FROM_STARTS = (
-    MEANS[0],
+    Mean("ALE, m", "ale", 3),
     Mean("overshoot, m", "overshoot", 3),
     Mean("back after, s", "recovery_time", 1),
     *MEANS[3:],
 )
-"""The same where cases say where they start."""
-COUNTS = ("agent", "drives", "failed")
+"""The same where cases say where they start, so that the largest error is that of the start."""
+SEARCHED = {
+    "fixed_speed": (Mean("entry speed, m/s", "highest_fixed_speed", 2), POSSIBLE, *MEANS[3:]),
+    "grip": (
+        Mean("fastest lap, s", "fastest_lap", 2), POSSIBLE, Mean("grip", "highest_grip", 2),
+        *MEANS[3:],
+    ),
+}  # fmt: skip
+"""The same by the setting that is searched for."""
+COUNTS = ("agent", "drives", "failed", "95 %")
 NOTE = (
-    "A drive fails unless it reaches the end of the path. The other columns are means over the "
+    "A drive fails unless it reaches the end of the path; beside the failures stands the "
+    "Clopper-Pearson interval of their rate. The other columns are means over the "
     "drives that did: largest and root mean square lateral error, root mean squares of speed "
     "error, steering rate and jerk, and the score that weights are tuned for (lower is better). "
     "Agents that fail more often have them over easier drives; some finish because they are slow. "
     "Overshoot is the largest lateral error on the other side of the path than the start; a "
-    "vehicle is back once its lateral error stays below 0.1 m."
+    "vehicle is back once its lateral error stays below 0.1 m. Entry speeds are the highest with "
+    "which a lane change is passed without touching a cone, and fastest laps those over all shares "
+    "of grip tried, each beside its share of what an optimal control problem says is possible."
 )
 SCORED = ("ale", "aoe", "rms_speed_error", "steering_rate_rms", "jerk_rms")
 """Metrics whose sum, each divided by its scale, is the score (`agents.weight_tuning.score`)."""
@@ -66,10 +82,12 @@ class Line(NamedTuple):
     def cells(self) -> list[str]:
         """Text of the columns of `headings`."""
         numbers = (
-            "–" if mean is None else f"{mean:.{column.decimals}f}"
+            "–" if mean is None else f"{column.factor * mean:.{column.decimals}f}"
             for mean, column in zip(self.means, self.columns, strict=True)
         )
-        return [self.label, f"{self.drives}", f"{self.failed}", *numbers]
+        low, high = (100.0 * end for end in rate_interval(self.failed, self.drives))
+        interval = f"{low:.0f}–{high:.0f} %"
+        return [self.label, f"{self.drives}", f"{self.failed}", interval, *numbers]
 
 
 def by_regime(cases: Iterable[Result]) -> dict[str, list[Result]]:
@@ -82,8 +100,13 @@ def by_regime(cases: Iterable[Result]) -> dict[str, list[Result]]:
 
 
 def columns_of(cases: Iterable[Result]) -> tuple[Mean, ...]:
-    """Return the columns of means for some cases."""
-    return FROM_STARTS if any(case.get("start") for case in cases) else MEANS
+    """Return the columns of means for the cases of a regime."""
+    for case in cases:
+        if search := case.get("search"):
+            return SEARCHED[str(search["setting"])]
+        if case.get("start"):
+            return FROM_STARTS
+    return MEANS
 
 
 def headings(columns: tuple[Mean, ...]) -> list[str]:
@@ -91,20 +114,46 @@ def headings(columns: tuple[Mean, ...]) -> list[str]:
     return [*COUNTS, *(column.heading for column in columns)]
 
 
-def lines(cases: Iterable[Result], columns: tuple[Mean, ...] | None = None) -> list[Line]:
-    """Return a line for each agent of one regime, by default with the columns of its cases."""
+def lines(cases: Iterable[Result]) -> list[Line]:
+    """Return a line for each agent of one regime."""
     cases = list(cases)
-    shown = columns_of(cases) if columns is None else columns
-    return [_line(label, group, shown) for label, group in by_label(cases).items()]
+    columns = columns_of(cases)
+    return [_line(label, group, columns) for label, group in by_label(cases).items()]
 
 
 def _line(label: str, cases: Sequence[Result], columns: tuple[Mean, ...]) -> Line:
-    finished = [case["metrics"] for case in cases if case.get("end") == "finished"]
-    means = tuple(
-        _mean([score(one) if column is SCORE else one.get(column.key) for one in finished])
-        for column in columns
-    )
+    finished = [case for case in cases if passed(case)]
+    means = tuple(_mean([figure(case, column) for case in finished]) for column in columns)
     return Line(label, len(cases), len(cases) - len(finished), means, columns)
+
+
+def passed(case: Result) -> bool:
+    """Return whether the drive of a case did what its regime asks for."""
+    return case.get("status") == "ok" and passes(case)
+
+
+def figure(case: Result, column: Mean) -> float | None:
+    """Return what a case has in a column of means; None if it has none."""
+    found = case["metrics"]
+    if column is SCORE:
+        return score(found)
+    return possible(case) if column is POSSIBLE else found.get(column.key)
+
+
+def possible(case: Result) -> float | None:
+    """Return the share of what is physically possible that a searched case reached.
+
+    An entry speed by the highest possible one, or the least possible lap time by the fastest lap;
+    None if no limit is known for the case.
+    """
+    conditions, found = case.get("conditions"), case["metrics"]
+    friction = conditions.get("friction") if isinstance(conditions, Mapping) else None
+    limit = limits.limit_of(str(case["trajectory"]), str(case["vehicle"]), friction)
+    if limit is None:
+        return None
+    if "fastest_lap" in found:
+        return float(limit / found["fastest_lap"])
+    return float(found["highest_fixed_speed"] / limit) if "highest_fixed_speed" in found else None
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -119,21 +168,27 @@ def score(metrics: Mapping[str, float]) -> float | None:
     return float(np.sum([metrics[key] for key in SCORED] / SCALES))
 
 
-def table(cases: Iterable[Result]) -> Table | None:
-    """Return a table for a terminal, with a group of lines for each regime; None without any."""
-    groups = by_regime(cases)
-    if not groups:
-        return None
-    shown = Table(
-        title="By regime", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD,
-        padding=(0, 1), pad_edge=False, caption=NOTE, caption_justify="left",
-    )  # fmt: skip
-    shown.add_column("regime", max_width=38, overflow="fold")
-    columns = columns_of(case for group in groups.values() for case in group)
-    for place, heading in enumerate(headings(columns)):
-        shown.add_column(heading.replace(" ", "\n"), justify="right" if place else "left")
-    for name, group in groups.items():
-        for place, line in enumerate(found := lines(group, columns)):
+def tables_of(cases: Iterable[Result]) -> list[Table]:
+    """Return tables for a terminal, with a group of lines for each regime; none without any.
+
+    Neighbouring regimes of equal columns share a table.
+    """
+    shown: list[Table] = []
+    columns: tuple[Mean, ...] | None = None
+    for name, group in by_regime(cases).items():
+        found = lines(group)
+        if found[0].columns != columns:
+            columns = found[0].columns
+            shown.append(_start(columns))
+        for place, line in enumerate(found):
             first = Text("" if place else name, style="bold")
-            shown.add_row(first, *map(Text, line.cells), end_section=place + 1 == len(found))
+            shown[-1].add_row(first, *map(Text, line.cells), end_section=place + 1 == len(found))
     return shown
+
+
+def _start(columns: tuple[Mean, ...]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
+    table.add_column("regime", max_width=30, overflow="fold")
+    for place, heading in enumerate(headings(columns)):
+        table.add_column(heading.replace(" ", "\n"), justify="right" if place else "left")
+    return table

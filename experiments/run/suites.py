@@ -31,16 +31,46 @@ LEARNED = ("ppo", "sac", "bc")
 DEMONSTRATION = "lpv-mpc-frozen"
 """Agent that shows why the frozen form must not be used."""
 
+CIRCUITS = tuple(f"circuit-{seed}" for seed in range(100))
+"""Circuits at the limit that `lpv-track train` and `tune` do not take."""
+
 _CAR = {"vehicles": ("bmw-320i",)}
 _TRUTH = {"name": "realtime", "estimator": "truth"}
+_BY_GRIP = {**_CAR, "trajectories": CIRCUITS[:3], "speed_modes": ("grip",)}
+_HALF_G = {**_CAR, "trajectories": LIMIT_PATHS[::10]}
 _AT_055_G = {**_CAR, "trajectories": LIMIT_PATHS[1::10]}
-_LANE_CHANGE = {**_CAR, "trajectories": ("double-lane-change",), "speed_modes": ("fixed",)}
+_LANE_CHANGE = {
+    "speed_modes": ("fixed",),
+    "search": {"setting": "fixed_speed", "low": 8.0, "high": 30.0, "resolution": 0.25},
+}
+_LANE_CHANGES = (
+    {**_LANE_CHANGE, **_CAR, "trajectories": ("iso-3888-1-1.61", "iso-3888-2-1.61")},
+    {**_LANE_CHANGE, "trajectories": ("iso-3888-1-2.0", "iso-3888-2-2.0")},
+)
+_LAPS = {
+    **_BY_GRIP, "env_settings": {"max_lateral_error": 0.5},
+    "search": {"setting": "grip", "low": 0.4, "high": 1.2, "resolution": 0.01},
+}  # fmt: skip
+DRY = {"name": "ideal", "friction": 0.9}
+"""Conditions of the lane changes and laps for which `experiments.limits` knows the limit."""
+_SENSED = {"name": "realtime", "friction": 0.9}
+
+
+def _slippery(start: float, end: float, factor: float) -> dict[str, Any]:
+    """Return conditions with a stretch of a road of friction 1 that is more slippery."""
+    stretch = {"slippery_stretch": [start, end], "slippery_factor": factor}
+    return {"name": "ideal", "friction": 1.0, **stretch}
+
+
 LIMITS: dict[str, list[dict[str, Any]]] = {
-    "0.50 to 0.95 g, drift plant": [
-        {
-            **_CAR, "trajectories": LIMIT_PATHS[:10],
-            "env_settings": {"plant": "drift"},
-        }
+    "random paths, 0.50 to 0.95 g, drift": [
+        {**_CAR, "trajectories": LIMIT_PATHS[:10], "env_settings": {"plant": "drift"}}
+    ],
+    "random paths, 0.50 to 0.95 g, multi-body": [
+        {**_CAR, "trajectories": LIMIT_PATHS[:10], "env_settings": {"plant": "multi-body"}}
+    ],
+    "circuits, 0.5 to 0.9 of grip, drift": [
+        {**_BY_GRIP, "grip": grip, "env_settings": {"plant": "drift"}} for grip in (0.5, 0.7, 0.9)
     ],
     "95 % of grip, brush tyres": [
         {
@@ -57,30 +87,28 @@ LIMITS: dict[str, list[dict[str, Any]]] = {
     "0.55 g, friction unknown, true state": [
         {**_AT_055_G, "conditions": {**_TRUTH, "friction": [0.5, 1.0]}, "seeds": range(2)}
     ],
-    "lane changes, 13 to 22 m/s": [
-        {**_LANE_CHANGE, "fixed_speed": speed, "conditions": _TRUTH, "seeds": range(2)}
-        for speed in (13.0, 16.0, 19.0, 22.0)
+    "lane changes of ISO 3888": [{**one, "conditions": DRY} for one in _LANE_CHANGES],
+    "lane changes of ISO 3888, realtime": [
+        {**one, "conditions": _SENSED, "seeds": range(2)} for one in _LANE_CHANGES
     ],
-    "lane change, 20 m/s, friction 0.9": [
-        {
-            **_LANE_CHANGE, "fixed_speed": 20.0, "conditions": {**_TRUTH, "friction": 0.9},
-            "seeds": range(6),
-        }
-    ],
+    "fastest laps": [{**_LAPS, "conditions": DRY}],
+    "fastest laps, realtime": [{**_LAPS, "conditions": _SENSED, "seeds": range(2)}],
     "9 m/s round corners, friction 0.8": [
         {
             "trajectories": SIX[:4], "speed_modes": ("fixed",), "fixed_speed": 9.0,
             "conditions": {"name": "ideal", "friction": 0.8},
         }
     ],
+    "28 m/s into hairpins": [
+        {"trajectories": ("hairpins",), "conditions": "realtime", "seeds": range(10)}
+    ],
+    "friction falls by 45 % for 150 m": [{**_HALF_G, "conditions": _slippery(150.0, 300.0, 0.55)}],
+    "15 m of ice": [{**_HALF_G, "conditions": _slippery(150.0, 165.0, 0.2)}],
     "slow actuators": [
         {
             "trajectories": HELD_OUT[:10], "conditions": "realtime",
             "vehicle_changes": {"max_steering_rate": 0.15, "max_jerk": 1.5},
         }
-    ],
-    "28 m/s into hairpins": [
-        {"trajectories": ("hairpins",), "conditions": "realtime", "seeds": range(10)}
     ],
     "another mass and tyres": [
         {
@@ -105,9 +133,9 @@ STANDING = tuple(
     )
     for arc_length in range(7, last + 1, 38)
 )  # fmt: skip
-"""The 183 standing starts of `recovery`, m: every 38 m, and 18 m or more before the end."""
+"""The 183 standing starts of `RECOVERY`, m: every 38 m, and 18 m or more before the end."""
 BESIDE_PATHS = {"straight": 0, "circle": 0, "T3": 740}
-"""Paths of the starts of `recovery` beside the path, and where; 30 m before a bend on T3."""
+"""Paths of the starts of `RECOVERY` beside the path, and where; 30 m before a bend on T3."""
 OFFSETS = (-4.5, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.5)
 """m."""
 DEGREES = (-80, -60, -40, -20, 0, 20, 40, 60, 80)
@@ -128,7 +156,7 @@ RECOVERY: dict[str, list[tuple[str, dict[str, float]]]] = {
         for name, s in BESIDE_PATHS.items()
     },
 }  # fmt: skip
-"""Regimes of the suite `recovery`: paths and starts."""
+"""Further regimes of the suite `limits`: paths and starts."""
 REGIMES = (*LIMITS, *RECOVERY)
 """Names of all regimes, in the order of tables."""
 
@@ -258,18 +286,27 @@ def independent(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
 
 
 def limits(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
-    """The regimes of `LIMITS` with every agent that does not solve to convergence."""
+    """The regimes of `LIMITS` and `RECOVERY`, with every agent that does not solve to convergence.
+
+    Paths of one regime have different seeds, so that no two drives share what is drawn; where
+    nothing is drawn there is one seed.
+    """
     _, fast = _by_speed(agent_names)
     specs = []
     for regime, grids in LIMITS.items():
         for one in grids:
-            most = seeds if len(seeds) > len(one.get("seeds", ())) else one["seeds"]
-            specs += grid(fast, **{**one, "seeds": most}, regime=regime)
+            given = one.get("conditions", "simulation")
+            drawn = (given if isinstance(given, str) else given["name"]) == "realtime"
+            count = max(len(seeds), len(one.get("seeds", ()))) if drawn else 1
+            for place, name in enumerate(one["trajectories"]):
+                own = range(place * count, (place + 1) * count)
+                specs += grid(fast, **{**one, "trajectories": (name,), "seeds": own}, regime=regime)
+    specs += recovery(fast, (0,))
     return specs
 
 
 def recovery(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
-    """The starts of `RECOVERY` with every agent that does not solve to convergence."""
+    """The regimes of `RECOVERY` alone."""
     _, fast = _by_speed(agent_names)
     return [
         spec

@@ -25,6 +25,7 @@ from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, derivative
 from lpv_track_env.conditions import IDEAL, Conditions
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.integration import integrate
+from lpv_track_env.kernels import ARC_LENGTH
 from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from lpv_track_env.vehicle import BMW_320I, M2_MINIBUS, VEHICLES, VehicleParameters
@@ -415,6 +416,23 @@ def test_drawn_friction_reaches_the_plant() -> None:
     assert 0.3 <= min(peaks) < 0.45
     assert 0.75 < max(peaks) <= 0.9
     assert env.friction == pytest.approx(0.6 * 1.0489)
+
+
+def test_a_slippery_stretch_reaches_the_plant_between_its_ends_alone() -> None:
+    """With and without a friction of the conditions, which multiplies it."""
+    for friction, own in ((math.inf, 1.0489), (0.8, 0.8 * 1.0489)):
+        conditions = Conditions(
+            estimator="truth", friction=friction, slippery_stretch=(3.0, 6.0), slippery_factor=0.5
+        )
+        env = PathTrackingEnv("T1", "bmw-320i", plant="drift", conditions=conditions)
+        env.reset(seed=0)
+        plant: Any = env._plant and env._plant.plant
+        seen = {}
+        for _ in range(150):
+            arc_length = env._record[ARC_LENGTH]
+            env.step(np.array([2.0, 0.0]))
+            seen[3.0 <= arc_length < 6.0] = plant.parameters.tire.p_dy1
+        assert seen == {True: pytest.approx(0.5 * own), False: pytest.approx(own)}
 
 
 def test_all_but_the_plant_is_the_same_code() -> None:

@@ -8,12 +8,11 @@ from rich.console import Console
 
 from experiments.run import regimes
 from experiments.run.console_tables import screen
-from experiments.run.suites import REGIMES
 from experiments.run.tables import current, setting_of
 from tests.helpers.made_results import METRICS, case, folder_of, page
 
 RATES = {"steering_rate_rms": 0.1, "jerk_rms": 2.0, "rms_speed_error": 0.25}
-SLOW, DRIFT = "slow actuators", REGIMES[0]
+SLOW, DRIFT = "slow actuators", "95 % of grip, brush tyres"
 
 
 def made() -> list[dict]:
@@ -37,7 +36,9 @@ def test_lines_count_failures_and_average_what_finished() -> None:
     assert (stanley.label, stanley.drives, stanley.failed) == ("stanley", 4, 2)
     # 0.08 m / 0.05 m + 0.03 / 0.1 rad + 0.25 / 0.5 m/s + 0.1 / 0.2 rad/s + 2 / 4 m/s^3
     assert stanley.means == pytest.approx((0.4, 0.08, 0.25, 0.1, 2.0, 3.4))
-    assert stanley.cells == ["stanley", "4", "2", "0.400", "0.080", "0.25", "0.100", "2.00", "3.40"]
+    assert stanley.cells == [
+        "stanley", "4", "2", "7–93 %", "0.400", "0.080", "0.25", "0.100", "2.00", "3.40",
+    ]  # fmt: skip
     # An old result lacks speed errors and rates.
     (old,) = regimes.lines(groups[DRIFT])
     assert old.means == (METRICS["mle"], METRICS["ale"], None, None, None, None)
@@ -49,10 +50,11 @@ def test_regimes_come_first_on_the_terminal_and_in_the_report(tmp_path: Path) ->
     console.print(tables)
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert not complete
-    assert text.index(DRIFT) < text.index(SLOW) < text.index("of one's own")
+    assert text.index(DRIFT[:12]) < text.index(SLOW[:12]) < text.index("of one's")
     row = next(line for line in text.splitlines() if "3.40" in line)
-    assert row.split()[-8:] == ["4", "2", "0.400", "0.080", "0.25", "0.100", "2.00", "3.40"]
-    assert regimes.table([case(8)]) is None
+    assert row.split()[-6:] == ["0.400", "0.080", "0.25", "0.100", "2.00", "3.40"]
+    assert text.index("Ranking") < text.index("By regime")
+    assert regimes.tables_of([case(8)]) == []
     folder_of(tmp_path / "with", made())
     shown = page(tmp_path / "with")
     assert shown.index("By regime</h2>") < shown.index("Against the published table</h2>")
@@ -76,14 +78,32 @@ def test_cases_with_a_start_show_how_they_come_back() -> None:
     cases = [case(1, regime="beside", start=away, metrics=back), case(2, regime=SLOW)]
     groups = regimes.by_regime(cases)
     (line,) = regimes.lines(groups["beside"])
-    assert regimes.headings(line.columns)[3:6] == ["MLE, m", "overshoot, m", "back after, s"]
-    assert line.cells[3:6] == [f"{METRICS['mle']:.3f}", "0.250", "4.6"]
+    assert regimes.headings(line.columns)[4:7] == ["ALE, m", "overshoot, m", "back after, s"]
+    assert line.cells[4:7] == [f"{METRICS['ale']:.3f}", "0.250", "4.6"]
     assert regimes.columns_of(groups[SLOW]) == regimes.MEANS
     console = Console(width=120, file=io.StringIO())
     console.print(screen(cases)[0])
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "overshoot" in text
     assert "4.6" in text
+
+
+def test_searches_show_what_is_reached_and_what_is_possible(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = {"iso": 20.0, "lap": 30.0}
+    monkeypatch.setattr(regimes.limits, "limit_of", lambda path, *_: known.get(path))
+    entry, lap = {"setting": "fixed_speed"}, {"setting": "grip"}
+    cases = [
+        case(1, trajectory="iso", regime="a", search=entry, metrics={"highest_fixed_speed": 19.0}),
+        case(2, trajectory="iso", regime="a", search=entry, metrics={"cone_clearance": -0.01}),
+        case(3, trajectory="lap", regime="b", search=lap, metrics={"fastest_lap": 40.0}),
+        case(4, trajectory="no", regime="b", search=lap, metrics={"fastest_lap": 50.0}),
+    ]
+    (passed,), (laps,) = (regimes.lines(group) for group in regimes.by_regime(cases).values())
+    assert passed.cells[1:6] == ["2", "1", "1–99 %", "19.00", "95"]
+    # The unknown limit has no share in the mean.
+    assert laps.cells[1:6] == ["2", "0", "0–84 %", "45.00", "75"]
 
 
 def test_starts_are_settings_of_their_own_but_within_a_regime() -> None:

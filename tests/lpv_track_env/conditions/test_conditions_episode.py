@@ -18,6 +18,7 @@ from lpv_track_env.conditions import layout as conditions_layout
 from lpv_track_env.conditions.vehicle import AIR_DENSITY
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.estimation import filter as filtering
+from lpv_track_env.kernels import ARC_LENGTH
 from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vehicle import VEHICLES
 
@@ -214,6 +215,35 @@ def test_a_vehicle_stops_within_its_friction() -> None:
         end = env.state
         wanted = (start[VX] ** 2 - end[VX] ** 2) / (2.0 * 0.95 * friction * GRAVITY)
         assert end[X] - start[X] == pytest.approx(wanted, rel=1e-6)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_slippery_stretch_lowers_the_friction_between_its_ends(closed: bool) -> None:
+    """Full brakes: before it the same bits as without, on it at most 0.95 of a quarter of mu g."""
+    path = trajectories.load("circle" if closed else "straight").with_speed(15.0)
+    given = IDEAL.replace(friction=0.8, rolling_factor=0.0)
+    slippery = given.replace(slippery_stretch=(5.0, 25.0), slippery_factor=0.25)
+    one, other = (
+        PathTrackingEnv(path, conditions=conditions, max_lateral_error=100.0)
+        for conditions in (given, slippery)
+    )
+    # On the closed path the stretch lies behind the seam.
+    start = {"arc_length": path.length - 2.0 if closed else 0.0}
+    for env in (one, other):
+        env.reset(seed=0, options=start)
+    lost: dict[bool, list[float]] = {True: [], False: []}
+    for _ in range(120):
+        before, place = other.state[VX], other._record[ARC_LENGTH] % path.length
+        action = np.array([-5.0, 0.0])
+        ours, theirs = one.step(action), other.step(action)
+        if not lost[True] and not 5.0 <= place < 25.0:
+            np.testing.assert_array_equal(ours[0], theirs[0])
+        lost[5.0 <= place < 25.0].append((before - theirs[4]["state"][VX]) / PERIOD)
+        if theirs[2] or theirs[4]["state"][VX] < 0.5:
+            break
+    assert max(lost[True]) == pytest.approx(0.95 * 0.25 * 0.8 * GRAVITY, rel=1e-6)
+    assert max(lost[False]) > 2.0 * max(lost[True])
+    assert len(lost[True]) > 20
 
 
 def test_side_wind_pushes_by_its_force() -> None:
