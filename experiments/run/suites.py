@@ -41,7 +41,7 @@ _HALF_G = {**_CAR, "trajectories": LIMIT_PATHS[::10]}
 _AT_055_G = {**_CAR, "trajectories": LIMIT_PATHS[1::10]}
 _LANE_CHANGE = {
     "speed_modes": ("fixed",),
-    "search": {"setting": "fixed_speed", "low": 8.0, "high": 30.0, "resolution": 0.25},
+    "search": {"setting": "fixed_speed", "low": 5.0, "high": 35.0, "resolution": 0.25},
 }
 _LANE_CHANGES = (
     {**_LANE_CHANGE, **_CAR, "trajectories": ("iso-3888-1-1.61", "iso-3888-2-1.61")},
@@ -52,8 +52,8 @@ _LAPS = {
     "search": {"setting": "grip", "low": 0.4, "high": 1.2, "resolution": 0.01},
 }  # fmt: skip
 DRY = {"name": "ideal", "friction": 0.9}
-"""Conditions of the lane changes and laps for which `experiments.limits` knows the limit."""
-_SENSED = {"name": "realtime", "friction": 0.9}
+"""Ideal conditions of the lane changes and laps, for which `experiments.limits` has the limits."""
+_KNOWN = {**_TRUTH, "friction": 0.9}
 
 
 def _slippery(start: float, end: float, factor: float) -> dict[str, Any]:
@@ -88,11 +88,11 @@ LIMITS: dict[str, list[dict[str, Any]]] = {
         {**_AT_055_G, "conditions": {**_TRUTH, "friction": [0.5, 1.0]}, "seeds": range(2)}
     ],
     "lane changes of ISO 3888": [{**one, "conditions": DRY} for one in _LANE_CHANGES],
-    "lane changes of ISO 3888, realtime": [
-        {**one, "conditions": _SENSED, "seeds": range(2)} for one in _LANE_CHANGES
+    "lane changes of ISO 3888, true state": [
+        {**one, "conditions": _KNOWN, "seeds": range(2)} for one in _LANE_CHANGES
     ],
     "fastest laps": [{**_LAPS, "conditions": DRY}],
-    "fastest laps, realtime": [{**_LAPS, "conditions": _SENSED, "seeds": range(2)}],
+    "fastest laps, true state": [{**_LAPS, "conditions": _KNOWN, "seeds": range(2)}],
     "9 m/s round corners, friction 0.8": [
         {
             "trajectories": SIX[:4], "speed_modes": ("fixed",), "fixed_speed": 9.0,

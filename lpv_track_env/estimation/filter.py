@@ -70,6 +70,9 @@ FIX_RESULTS = ("used", "gated", "late", "duplicate", "not finite")
 WORK = 2 * ENTRIES
 """Size of the scratch array."""
 
+SLIDING_NOISE = 24.0
+"""Growth of the process noise of vy and r up to where tyres slide, since the friction that limits
+their forces is known badly: 1 + this times the square of the slip."""
 JACOBIAN_STEP = 0.35
 """Largest product of step and poles for the Jacobian: it gives four digits of its entries."""
 DIFFERENCES = (1e-4, 1e-4, 1e-5, 1e-6)
@@ -161,11 +164,15 @@ def predict(m: Array, a: Any, delta: Any, dt: Any, settings: Array, work: Array)
     m[X] += dx
     m[Y] += dy
     propagate_covariance(m, f, work[ENTRIES:])
+    # Slip angles by those at which all of a patch slides.
+    front = abs(wheels - (vy + p2 * r) * q) * tyre[2]
+    sliding = min(max(front, abs(p3 * r - vy) * q * tyre[3]), 1.0)
+    doubt = dt * (1.0 + SLIDING_NOISE * sliding * sliding)
     d = COVARIANCE
     m[d] += s[VX_DENSITY] * dt
-    m[d + DIAGONAL * VY] += s[VY_DENSITY] * dt
+    m[d + DIAGONAL * VY] += s[VY_DENSITY] * doubt
     m[d + DIAGONAL * PSI] += s[PSI_DENSITY] * dt
-    m[d + DIAGONAL * YAW_RATE] += s[R_DENSITY] * dt
+    m[d + DIAGONAL * YAW_RATE] += s[R_DENSITY] * doubt
     m[d + DIAGONAL * X] += s[POSITION_DENSITY] * dt
     m[d + DIAGONAL * Y] += s[POSITION_DENSITY] * dt
     m[d + DIAGONAL * GYRO_BIAS] += s[GYRO_DENSITY] * dt
@@ -206,12 +213,12 @@ def update(
 @compiled_internal
 def take_reading(
     m: Array, first: int, second: int, value: Any, variance: Any, row: int, gated: int,
-    settings: Array, work: Array,
+    doubted: int, most: Any, settings: Array, work: Array,
 ) -> None:  # fmt: skip
     """Update the filter with one reading, NaN for none, and count the outcome.
 
-    After enough rejections in a row a reading is used nevertheless: the filter is wrong, not the
-    sensor.
+    After `most` rejections in a row a reading is used nevertheless: the filter is wrong, not the
+    sensor. It is then the state `doubted` that is taken to be far from its estimate.
     """
     if not math.isfinite(value):
         return
@@ -226,9 +233,9 @@ def take_reading(
         return
     m[gated] += 1.0
     m[row] += 1.0
-    if m[row] >= settings[MOST_IN_A_ROW]:
+    if m[row] >= most:
         m[row] = 0.0
-        inflate(m, first if second < 0 else second, innovation)
+        inflate(m, doubted, innovation)
         update(m, first, second, innovation, variance, math.inf, work)
 
 
@@ -243,16 +250,20 @@ def take_readings(
     m: Array, speed: Any, yaw_rate: Any, heading: Any, settings: Array, work: Array
 ) -> None:
     """Update the filter with wheel speed (m/s), yaw rate (rad/s) and heading (rad); NaN: none."""
-    s = settings
+    s, most = settings, settings[MOST_IN_A_ROW]
     m[READING_NIS] = m[READINGS] = 0.0
-    take_reading(m, VX, -1, speed, s[SPEED_VARIANCE], SPEED_IN_A_ROW, SPEED_GATED, s, work)
+    take_reading(
+        m, VX, -1, speed, s[SPEED_VARIANCE], SPEED_IN_A_ROW, SPEED_GATED, VX, most, s, work
+    )
+    # A vehicle that skids turns otherwise than its model: the second reading in a row is believed.
     take_reading(
         m, YAW_RATE, GYRO_BIAS, yaw_rate, s[YAW_RATE_VARIANCE], YAW_RATE_IN_A_ROW, YAW_RATE_GATED,
-        s, work,
+        YAW_RATE, min(most, 2.0), s, work,
     )  # fmt: skip
     take_reading(
-        m, PSI, HEADING_BIAS, heading, s[HEADING_VARIANCE], HEADING_IN_A_ROW, HEADING_GATED, s, work
-    )
+        m, PSI, HEADING_BIAS, heading, s[HEADING_VARIANCE], HEADING_IN_A_ROW, HEADING_GATED,
+        HEADING_BIAS, most, s, work,
+    )  # fmt: skip
 
 
 @compiled_internal
