@@ -207,6 +207,10 @@ class Case(BaseCase):
         ValueError
             For an unknown one, listing the known ones and the nearest.
         """
+        if self.search:
+            for case in self._ends_of_search():
+                case.check()
+            return
         check_settings(self.agent, self.agent_settings)
         weights = self.agent_settings.get("weights")
         if self.agent in agents.names() and isinstance(weights, Mapping):
@@ -221,8 +225,6 @@ class Case(BaseCase):
         for key in self.env_settings:
             choose("environment setting", key, keyword_settings(PathTrackingEnv))
         self.resolved_env_settings()
-        for case in self._ends_of_search():
-            case.check()
         for key in self.vehicle_changes:
             choose("vehicle field", key, VEHICLE_FIELDS)
         car = self.make_vehicle()
@@ -237,15 +239,13 @@ class Case(BaseCase):
         return replace(self, search={}, **{setting: value})
 
     def _ends_of_search(self) -> list["Case"]:
-        """Return the cases of a search's lowest and highest value; none without a search.
+        """Return the cases of a search's lowest and highest value.
 
         Raises
         ------
         ValueError
             If the case has a value of the setting already, or as `Search`.
         """
-        if not self.search:
-            return []
         wanted = Search(**self.search)
         if getattr(self, wanted.setting) is not None:
             raise ValueError(f"give {wanted.setting} or a search for its highest value, not both")
