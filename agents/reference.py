@@ -151,6 +151,18 @@ def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, no
 
 
 @compiled_internal
+def way_beside(offset: Any, decay: Any, s: Any, curvature: Any) -> Any:
+    """Return how much longer the way of an approach is than the path (1/m) at s (m), at least 1.
+
+    `offset` and `decay` are those of `approach`.
+    """
+    if offset == 0.0:
+        return 1.0
+    beside = offset * math.exp(-s / decay)
+    return max(math.hypot(1.0 - curvature * beside, beside / decay), 1.0)
+
+
+@compiled_internal
 def fill_nodes_at(
     curvature: Array, first_speed: Any, speed: Array, period: Any, lengths: Array, pace: Any,
     rate: Any, grip: Any, braking: Any, offset: Any, decay: Any, capped: Array, nodes: Array,
@@ -185,10 +197,7 @@ def fill_nodes_at(
             # The share of the reference's own time.
             rest *= (fastest + 0.5 * gain) / v
         fastest += gain
-        if offset != 0.0:
-            beside = offset * math.exp(-s / decay)
-            along = 1.0 - float(curvature[min(at, last)]) * beside
-            rest /= max(math.hypot(along, beside / decay), 1.0)
+        rest /= way_beside(offset, decay, s, float(curvature[min(at, last)]))
         while rest > 1e-9:
             interval = min(at, last)
             step, after = left, end

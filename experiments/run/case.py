@@ -236,7 +236,8 @@ class Case(BaseCase):
 
     def _with(self, setting: str, value: float) -> "Case":
         """Return the case of a single drive of a search."""
-        return replace(self, search={}, **{setting: value})
+        changes: dict[str, Any] = {"search": {}, setting: value}
+        return replace(self, **changes)
 
     def _ends_of_search(self) -> list["Case"]:
         """Return the cases of a search's lowest and highest value.

@@ -148,6 +148,8 @@ def possible(case: Result) -> float | None:
     """
     conditions, found = case.get("conditions"), case["metrics"]
     friction = conditions.get("friction") if isinstance(conditions, Mapping) else None
+    if not isinstance(friction, float):
+        return None
     limit = limits.limit_of(str(case["trajectory"]), str(case["vehicle"]), friction)
     if limit is None:
         return None

@@ -93,13 +93,15 @@ def test_searches_show_what_is_reached_and_what_is_possible(
 ) -> None:
     known = {"iso": 20.0, "lap": 30.0}
     monkeypatch.setattr(regimes.limits, "limit_of", lambda path, *_: known.get(path))
-    entry, lap = {"setting": "fixed_speed"}, {"setting": "grip"}
+    entry = {"regime": "a", "search": {"setting": "fixed_speed"}}
+    lap = {"regime": "b", "search": {"setting": "grip"}, "conditions": {"friction": 0.9}}
     cases = [
-        case(1, trajectory="iso", regime="a", search=entry, metrics={"highest_fixed_speed": 19.0}),
-        case(2, trajectory="iso", regime="a", search=entry, metrics={"cone_clearance": -0.01}),
-        case(3, trajectory="lap", regime="b", search=lap, metrics={"fastest_lap": 40.0}),
-        case(4, trajectory="no", regime="b", search=lap, metrics={"fastest_lap": 50.0}),
-    ]
+        case(1, trajectory="iso", metrics={"highest_fixed_speed": 19.0}, **entry,
+             conditions={"friction": 0.9}),
+        case(2, trajectory="iso", metrics={"cone_clearance": -0.01}, **entry),
+        case(3, trajectory="lap", metrics={"fastest_lap": 40.0}, **lap),
+        case(4, trajectory="no", metrics={"fastest_lap": 50.0}, **lap),
+    ]  # fmt: skip
     (passed,), (laps,) = (regimes.lines(group) for group in regimes.by_regime(cases).values())
     assert passed.cells[1:6] == ["2", "1", "1–99 %", "19.00", "95"]
     # The unknown limit has no share in the mean.
