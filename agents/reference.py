@@ -152,9 +152,10 @@ def fill_nodes(curvature: Array, first_speed: Any, speed: Array, period: Any, no
 
 @compiled_internal
 def way_beside(offset: Any, decay: Any, s: Any, curvature: Any) -> Any:
-    """Return how much longer the way of an approach is than the path (1/m) at s (m), at least 1.
+    """Return the length of an approach by that of the path below it, at least 1.
 
-    `offset` and `decay` are those of `approach`.
+    At the arc length s (m), where the path has a curvature (1/m); `offset` and `decay` (m) are
+    those of `approach`.
     """
     if offset == 0.0:
         return 1.0

@@ -245,11 +245,15 @@ class Case(BaseCase):
         Raises
         ------
         ValueError
-            If the case has a value of the setting already, or as `Search`.
+            If the case has a value of the setting already, for speeds that the vehicle does not
+            reach, or as `Search`.
         """
         wanted = Search(**self.search)
         if getattr(self, wanted.setting) is not None:
             raise ValueError(f"give {wanted.setting} or a search for its highest value, not both")
+        fastest = self.make_vehicle().speed_range[1]
+        if wanted.setting == "fixed_speed" and wanted.high > fastest:
+            raise ValueError(f"search: high must be at most the vehicle's top speed, {fastest:g}")
         return [self._with(wanted.setting, wanted.value(k)) for k in (0, wanted.last)]
 
     def packages(self) -> tuple[str, ...]:

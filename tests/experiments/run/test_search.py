@@ -93,6 +93,9 @@ def test_a_case_refuses_a_value_beside_a_search_and_a_search_that_cannot_drive()
     cases = {
         "not both": Case("stanley", "circle", speed_mode="fixed", fixed_speed=3.0, search=lap),
         "needs speed_mode='fixed'": Case("stanley", "circle", search=lap),
+        "at most the vehicle's top speed, 30": Case(
+            "stanley", "circle", speed_mode="fixed", search={**lap, "high": 31.0}
+        ),
         "unknown setting": Case("stanley", "circle", search={**lap, "setting": "speed"}),
     }
     for words, case in cases.items():

@@ -1,6 +1,7 @@
 """Suites: what they drive, and that all of it can be driven."""
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import pytest
 import agents
 import trajectories
 from experiments.jobs.job import TRAINING_PATHS, VALIDATION_PATHS
+from experiments.limits import limit_of
 from experiments.run.case import Case
 from experiments.run.suites import (
     BESIDE,
@@ -17,6 +19,7 @@ from experiments.run.suites import (
     LIMIT_PATHS,
     LIMITS,
     RAW,
+    RECOVERY,
     REGIMES,
     SIX,
     SUITES,
@@ -45,17 +48,37 @@ def test_cases_of_a_suite_are_valid_and_distinct(suite: str) -> None:
 def test_limits_drives_every_regime_with_the_same_cases_for_each_agent() -> None:
     names = ["stanley", "lpv-nmpc", "lpv-nmpc-ipopt"]
     cases = [Case(**spec) for spec in SUITES["limits"](names, [0])]
-    for case in cases:
+    counts = [10, 10, 9, 10, 20, 20, 4, 8, 3, 6, 4, 10, 10, 10, 10, 10]
+    assert Counter(case.agent for case in cases) == dict.fromkeys(names[:2], sum(counts) + 426)
+    assert len({case.id for case in cases}) == len(cases)
+    own = [case for case in cases if case.agent == "stanley"]
+    for case in own[: sum(counts)]:
         case.check()
-    assert len({case.id for case in cases}) == len(cases) == 2 * 108
-    assert Counter(case.agent for case in cases) == {"stanley": 108, "lpv-nmpc": 108}
-    drives = Counter(case.regime for case in cases if case.agent == "stanley")
-    assert tuple(drives) == tuple(LIMITS)
-    assert list(drives.values()) == [10, 10, 20, 20, 8, 6, 4, 10, 10, 10]
-    more = Counter(spec["regime"] for spec in SUITES["limits"](["stanley"], range(3)))
-    assert list(more.values()) == [30, 30, 30, 30, 12, 6, 12, 30, 10, 30]
+    drives = Counter(case.regime for case in own)
+    assert tuple(drives) == REGIMES == (*LIMITS, *RECOVERY)
+    assert list(drives.values())[: len(LIMITS)] == counts
     used = {case.trajectory for case in cases if case.trajectory.startswith("random-limit")}
     assert used < set(LIMIT_PATHS)
+    # More seeds where something is drawn, and another one for each path.
+    more = [Case(**spec) for spec in SUITES["limits"](["stanley"], range(5))]
+    drives = Counter(case.regime for case in more)
+    several = [10, 10, 9, 10, 50, 50, 4, 20, 3, 15, 4, 10, 10, 10, 50, 50]
+    assert list(drives.values())[: len(LIMITS)] == several
+    for name in ("0.55 g, friction unknown", "slow actuators"):
+        seeds = [case.seed for case in more if case.regime == name]
+        assert len(seeds) == len(set(seeds)) == 50
+
+
+def test_the_limits_of_searched_cases_are_known() -> None:
+    """Reports show entry speeds and lap times beside what is possible."""
+    cases = [Case(**spec) for spec in SUITES["limits"](["stanley"], [0])]
+    searched = [case for case in cases if case.search]
+    assert len(searched) == 4 + 8 + 3 + 6
+    for case in searched:
+        assert isinstance(case.conditions, Mapping)
+        limit = limit_of(case.trajectory, case.vehicle, case.conditions["friction"])
+        assert limit is not None
+        assert 10.0 < limit < 120.0
 
 
 def test_recovery_drives_from_the_same_starts_with_each_agent() -> None:
@@ -71,7 +94,6 @@ def test_recovery_drives_from_the_same_starts_with_each_agent() -> None:
     for name in ("T1", "T2", "T3", "T4", "T5", "T6", "u-turn"):
         arcs = [case.start["arc_length"] for case in standing if case.trajectory == name]
         assert 18.0 <= trajectories.load(name).length - max(arcs) < 18.0 + 38.0
-    assert (*LIMITS, *starts) == REGIMES
 
 
 def test_default_agents_are_those_to_drive_with() -> None:
