@@ -1,12 +1,18 @@
 """The reference of an episode: the path to track, at the speed that the environment is asked for.
 
 In the mode "grip" the speed is planned anew for the vehicle. Its tyres, as `tyres` describes them,
-hold the lateral acceleration ay beside a longitudinal one ax as long as neither axle slides::
+hold the lateral acceleration ay beside the longitudinal one a of their own as long as neither axle
+slides::
 
-    |ay| <= sqrt((mu g)^2 - ax^2) min(1 - h ax / (g lr), 1 + h ax / (g lf))
+    |ay| <= sqrt((mu g)^2 - a^2) min(1 - h a / (g lr), 1 + h a / (g lf))
 
-(front and rear axle, lightened by accelerating and by braking). The profile keeps ax and ay to the
-share `grip` of that region.
+(front and rear axle, lightened by accelerating and by braking). The profile uses the share `grip`
+of that region. Tyres that hold ay slip by angles alpha and thereby brake: of a, this is left::
+
+    ax = a - ay (lr sin(alpha_f) + lf sin(alpha_r)) / L - rolling deceleration
+
+So a steady turn takes some a, and the speed in it is a little lower than sqrt(grip mu g R). Braking
+is planned as if the drag did not help.
 """
 
 import math
@@ -15,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 import trajectories
 from lpv_track_env import plants, tyres
@@ -24,12 +31,16 @@ from trajectories import ReferencePath, SpeedLimits
 from trajectories.arguments import Number, shown
 from trajectories.importers import imported
 from trajectories.naming import choose
-from trajectories.speed import GRAVITY, constant_speed, replanned
+from trajectories.speed import constant_speed, replanned
+
+Array = NDArray[np.float64]
 
 SPEED_MODES = ("variable", "fixed", "grip")
 SPEED = Number(0.0, 1000.0, "m/s", above=True)
 GRIP = Number(0.05, 2.0)
 """Rule of the share of grip that a profile uses; beyond 1 it cannot be driven."""
+CORNERS = 17
+"""Corners of the polygon of accelerations."""
 ORDINARY_FRICTION = 1.0
 """Coefficient of friction for which speeds are planned where tyres are linear."""
 
@@ -80,22 +91,61 @@ def grip_limits(
     where tyres are linear.
     """
     friction = friction if friction < math.inf else ORDINARY_FRICTION
-    longest = tyres.of(car, friction)[0]
+    a_max = tyres.of(car, friction)[0]
     slowest, fastest = car.longitudinal_acceleration_range
+    corners = accelerations(car, friction, grip)
     own = path.metadata.get("limits", {})
     return SpeedLimits(
         max_speed=car.speed_range[1],
-        max_lateral_acceleration=grip * friction * GRAVITY,
-        max_acceleration=min(fastest, longest),
-        max_deceleration=min(-slowest, longest),
+        # That of a steady turn: more is possible only while the speed falls.
+        max_lateral_acceleration=float(np.interp(0.0, *corners.T)),
+        max_acceleration=min(fastest, a_max, corners[-1, 0]),
+        max_deceleration=min(-slowest, a_max, -corners[0, 0]),
         max_jerk=car.max_jerk,
         max_steering_rate=car.max_steering_rate,
         wheelbase=car.wheelbase,
-        max_total_acceleration=grip * friction * GRAVITY,
-        front_load_transfer=friction * car.centre_of_gravity_height / car.rear_axle_distance,
-        rear_load_transfer=friction * car.centre_of_gravity_height / car.front_axle_distance,
+        corners=tuple((ax, ay) for ax, ay in corners.tolist()),
         **{name: own[name] for name in ("end_speed", "min_speed") if name in own},
     )
+
+
+def accelerations(car: VehicleParameters, friction: float, grip: float) -> Array:
+    """Return the corners (ax, ay), m/s^2, of the polygon of accelerations at a share of grip.
+
+    They go from braking to accelerating, (n, 2); the polygon is convex and within the region of the
+    module's description, scaled by `grip`.
+    """
+    _, limit, *sharpness, front, rear = tyres.of(car, friction)
+    angle = np.linspace(np.pi, 0.0, CORNERS)
+    whole = limit * np.cos(angle)
+    lightest = np.minimum(1.0 + front * whole, 1.0 + rear * whole)
+    a = grip * whole
+    ay = grip * limit * np.sin(angle) * np.maximum(lightest, tyres.LEAST_LOAD)
+    within = np.clip(a, -0.999 * limit, 0.999 * limit)
+    left = np.sqrt(limit**2 - within**2)
+    drag = np.full(CORNERS, car.rolling_deceleration)
+    shares = car.rear_axle_distance / car.wheelbase, car.front_axle_distance / car.wheelbase
+    for n, transfer, share in zip(sharpness, (front, rear), shares, strict=True):
+        load = np.maximum(1.0 + transfer * within, tyres.LEAST_LOAD)
+        # The brush tyre's slip angle by its share of the largest force, 1 - (1 - z)^3.
+        z = 1.0 - np.cbrt(1.0 - np.minimum(ay / (left * load), 1.0))
+        slip = z * (left / limit) * load / n
+        drag += share * ay * np.sin(np.minimum(slip, 0.5 * np.pi))
+    corners = np.column_stack([np.where(a < -1e-9, a, a - drag), ay])
+    return _upper_hull(corners)
+
+
+def _upper_hull(points: Array) -> Array:
+    """Return those points (n, 2) that form the upper side of their convex hull, from left."""
+    hull: list[Array] = []
+    for x, y in points[np.lexsort((points[:, 1], points[:, 0]))]:
+        while len(hull) > 1:
+            (x0, y0), (x1, y1) = hull[-2:]
+            if (x1 - x0) * (y - y0) < (y1 - y0) * (x - x0):
+                break
+            hull.pop()
+        hull.append(np.array([x, y]))
+    return np.array(hull)
 
 
 def reference(

@@ -10,14 +10,15 @@ A closed path is a periodic problem: its differences go on over the seam.
 
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import linprog
 
-from trajectories.arguments import Number, array, check_fields, instance_of
+from trajectories.arguments import Number, array, check_fields, instance_of, numbers
 from trajectories.path import MINIMUM_POINTS, ReferencePath
 
 Array = NDArray[np.float64]
@@ -38,9 +39,7 @@ JERK_MARGIN = 0.92
 LIMIT = Number(1e-3, 1e6)
 """Rule of every limit of a profile, in SI units."""
 SPACINGS = Number(1e-3, 1e9, "m")
-TRANSFER = Number(0.0, 1e3)
-LEAST_LATERAL = 0.1
-"""Share of the lateral acceleration that load transfer leaves at least."""
+CORNER = Number(-1e6, 1e6)
 LONGEST = 40_000.0
 """m: longest path that is planned; it takes some ten seconds."""
 PLANS = 64
@@ -77,15 +76,15 @@ class SpeedLimits:
     max_total_acceleration
         m/s^2, of the vector of longitudinal and lateral acceleration: what a tyre that brakes lacks
         in the turn. None: each has its own bound alone.
-    front_load_transfer, rear_load_transfer
-        Share by which the lateral acceleration that is left beside `max_total_acceleration` falls
-        if all of that accelerates, or brakes: load leaves the front axle, or the rear one. In
-        proportion for less.
+    corners
+        Corners (longitudinal, lateral), m/s^2, of a convex polygon that holds both accelerations,
+        from the hardest braking to the hardest accelerating: what is left of any other kind, such
+        as that of a vehicle whose axles shift load.
 
     Raises
     ------
     ValueError
-        If a limit is not a number from 0.001 to 1e6, or a transfer not one from 0 to 1000.
+        If a limit is not a number from 0.001 to 1e6, or the corners do not form such a polygon.
     """
 
     max_speed: float
@@ -98,17 +97,22 @@ class SpeedLimits:
     end_speed: float = 1.5
     min_speed: float = 1.0
     max_total_acceleration: float | None = None
-    front_load_transfer: float = 0.0
-    rear_load_transfer: float = 0.0
+    corners: tuple[tuple[float, float], ...] | None = None
 
     def __post_init__(self) -> None:
         given = [name for name, value in vars(self).items() if value is not None]
         needed = {item.name for item in fields(self) if item.default is not None}
-        rules = {
-            name: TRANSFER if name.endswith("_transfer") else LIMIT
-            for name in sorted(needed | set(given))
-        }
+        rules = dict.fromkeys(sorted(needed | set(given) - {"corners"}), LIMIT)
         check_fields(self, rules, "speed limits: ")
+        if self.corners is not None:
+            corners = [numbers("speed limits: corners", one, CORNER, 2) for one in self.corners]
+            steps = np.diff(np.array(corners), axis=0)
+            turns = steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0]
+            if len(corners) < 2 or not (steps[:, 0] > 0.0).all() or (turns > 0.0).any():
+                raise ValueError(
+                    "speed limits: corners must be those of a convex polygon, in order"
+                )
+            object.__setattr__(self, "corners", tuple(corners))
 
     @property
     def deceleration(self) -> float:
@@ -254,54 +258,59 @@ def _smooth(values: Array, at: Array, *, closed: bool) -> Array:
     return smoothed
 
 
-def _within_circle(
-    bent: Array, caps: Array, difference: sparse.csr_matrix, limits: SpeedLimits, radius: float
+class _Facet(NamedTuple):
+    """A bound on the accelerations a and a_y: `along` a + `across` a_y <= `bound`."""
+
+    along: float
+    across: float
+    bound: float
+    idle: float
+    """Lateral acceleration up to which the other limits keep this one, m/s^2."""
+
+
+def _facets(limits: SpeedLimits) -> list[_Facet]:
+    """Return the facets of the region of `limits` that its other bounds do not keep."""
+    facets = []
+    most = {1.0: limits.max_acceleration, -1.0: limits.deceleration}
+    if (radius := limits.max_total_acceleration) is not None:
+        half = 0.25 * np.pi / FACETS
+        for sign, largest in most.items():
+            idle = np.sqrt(max(radius**2 - largest**2, 0.0)) * np.cos(half)
+            for facet in range(FACETS):
+                if radius * np.cos(2.0 * half * (facet + 1)) < largest:
+                    angle = half * (2 * facet + 1)
+                    normal = sign * np.cos(angle), np.sin(angle)
+                    facets.append(_Facet(*normal, radius * np.cos(half), idle))
+    for (x, y), (next_x, next_y) in pairwise(limits.corners or ()):
+        along, across = y - next_y, next_x - x
+        bound = along * x + across * y
+        idle = (bound - abs(along) * most[1.0 if along > 0.0 else -1.0]) / across
+        facets.append(_Facet(along, across, bound, idle))
+    return facets
+
+
+def _within_region(
+    bent: Array, caps: Array, difference: sparse.csr_matrix, limits: SpeedLimits
 ) -> tuple[sparse.csr_matrix, Array]:
-    """Bound total acceleration in the cells by `radius`: matrix on squared speeds, upper bounds.
+    """Bound both accelerations in the cells by `_facets`: matrix on squared speeds, upper bounds.
 
     Longitudinal acceleration is `difference` b, in the cells; the lateral one at either end of a
-    cell is `bent` b, (m,) 1/m. They keep within a polygon in the circle, whose facets have the
-    normals (+-cos, sin); load transfer lowers its corners, which tilts the facets. Facets and cells
-    that other bounds keep from it are left out. Where a speed may not fall to what the lateral
-    acceleration allows, nothing is left for braking.
+    cell is `bent` b, (m,) 1/m. Where a speed may not fall to what the lateral acceleration allows,
+    nothing is left for braking.
     """
-    bent = np.minimum(bent, radius / caps)
+    bent = np.minimum(bent, limits.max_lateral_acceleration / caps)
     lateral = sparse.diags(bent).tocsr()
     most_lateral = bent * caps
     first = np.arange(difference.shape[0])
     last = (first + 1) % len(bent)
-    rows = [sparse.csr_matrix((0, len(bent)))]
-    half = 0.25 * np.pi / FACETS
-    for sign, most, transfer in (
-        (1.0, limits.max_acceleration, limits.front_load_transfer),
-        (-1.0, limits.deceleration, limits.rear_load_transfer),
-    ):
-        rest = np.sqrt(max(radius**2 - most**2, 0.0)) * np.cos(half)
-        rest *= max(1.0 - transfer * most / radius, LEAST_LATERAL)
-        cells = np.flatnonzero(np.maximum(most_lateral[first], most_lateral[last]) > rest)
-        for facet in range(FACETS):
-            if radius * np.cos(2.0 * half * (facet + 1)) < most:
-                angle = half * (2 * facet + 1)
-                along, across = _tilted(angle, half, transfer)
-                longitudinal = sign * along * difference[cells]
-                rows += [longitudinal + across * lateral[ends[cells]] for ends in (first, last)]
-    matrix = sparse.vstack(rows, format="csr")
-    return matrix, np.full(matrix.shape[0], radius * np.cos(half))
-
-
-def _tilted(angle: float, half: float, transfer: float) -> tuple[float, float]:
-    """Return the normal of a facet in the unit circle whose corners load transfer has lowered.
-
-    The corners are at `angle` -+ `half`; the facet's distance, by which the normal is scaled, stays
-    that of the facet without transfer.
-    """
-    ends = np.array([angle - half, angle + half])
-    lost = 1.0 - np.maximum(1.0 - transfer * np.cos(ends), LEAST_LATERAL)
-    across = np.sin(angle) * np.sin(ends)
-    tilt, steeper = np.linalg.solve(
-        np.column_stack([np.cos(ends), across * (1.0 - lost)]), across * lost
-    )
-    return np.cos(angle) + tilt, np.sin(angle) * (1.0 + steeper)
+    larger = np.maximum(most_lateral[first], most_lateral[last])
+    rows, bounds = [sparse.csr_matrix((0, len(bent)))], [np.empty(0)]
+    for facet in _facets(limits):
+        cells = np.flatnonzero(larger > facet.idle)
+        longitudinal = facet.along * difference[cells]
+        rows += [longitudinal + facet.across * lateral[ends[cells]] for ends in (first, last)]
+        bounds.append(np.full(2 * len(cells), facet.bound))
+    return sparse.vstack(rows, format="csr"), np.concatenate(bounds)
 
 
 def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: bool) -> Array:
@@ -328,9 +337,7 @@ def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: bo
     squared = _without_jerk(upper, h, limits, closed=closed)
     identity = sparse.identity(inner, format="csr")
     nothing = sparse.csr_matrix((cells, inner))
-    circle, radius = sparse.csr_matrix((0, m)), np.empty(0)
-    if (total := limits.max_total_acceleration) is not None:
-        circle, radius = _within_circle(bent, caps, difference, limits, total)
+    region, most = _within_region(bent, caps, difference, limits)
     fastest = np.inf
     for _ in range(ITERATIONS):
         last = np.maximum(squared, lower)[between]
@@ -348,7 +355,7 @@ def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: bo
                 sparse.hstack([slope - change, 0 * identity]),
                 sparse.hstack([change, -identity]),
                 sparse.hstack([-change, -identity]),
-                sparse.hstack([circle, sparse.csr_matrix((len(radius), inner))]),
+                sparse.hstack([region, sparse.csr_matrix((len(most), inner))]),
             ],
             format="csr",
         )
@@ -359,7 +366,7 @@ def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: bo
             standing = allowed * end**-0.5
             faster[0] = min(faster[0], standing)
             slower[-1] = min(slower[-1], standing)
-        bounds = np.concatenate([faster, slower, constant, constant, np.zeros(2 * inner), radius])
+        bounds = np.concatenate([faster, slower, constant, constant, np.zeros(2 * inner), most])
         weight = np.maximum(squared, end) ** -1.5
         cost = np.concatenate([-weight, np.full(inner, CHATTER_WEIGHT)])
         result = linprog(

@@ -279,6 +279,30 @@ def test_total_acceleration_keeps_within_its_circle(most: float, closed: bool) -
         dataclasses.replace(limits, max_total_acceleration=0.0)
 
 
+def test_accelerations_keep_within_a_polygon() -> None:
+    """The same drive as above, within a polygon that leaves less for accelerating in a turn."""
+    s = np.arange(0.0, 400.0 + 0.5 * SPACING, SPACING)
+    curvature = 0.03 * np.sin(np.pi * s / 400.0) ** 4
+    corners = np.array([(-5.0, 0.0), (-3.0, 4.0), (-1.0, 5.0), (1.0, 4.0), (4.0, 0.0)])
+    limits = SpeedLimits(30.0, 4.5, 5.0, 5.0, max_jerk=100.0, end_speed=20.0)
+    free, bound = (
+        plan_speed(curvature, SPACING, given)
+        for given in (limits, dataclasses.replace(limits, corners=corners.tolist()))
+    )
+
+    def beyond(speed: np.ndarray) -> float:
+        along = np.gradient(speed**2, SPACING) / 2.0
+        across = speed**2 * curvature
+        return float((across - np.interp(along, *corners.T)).max())
+
+    assert beyond(free) > 0.5
+    assert -0.1 < beyond(bound) < 0.05
+    assert (bound <= free + 1e-3).all()
+    for wrong in ([(-1.0, 0.0)], corners[::-1], [(-1.0, 1.0), (0.0, 0.5), (1.0, 1.0)], [(1.0,)]):
+        with pytest.raises(ValueError, match="speed limits: corners"):
+            dataclasses.replace(limits, corners=wrong)
+
+
 def test_a_kink_slows_the_profile_down_but_never_stops_it() -> None:
     kappa = np.zeros(400)
     kappa[200] = 4.0
