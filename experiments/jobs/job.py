@@ -257,11 +257,6 @@ def random_names(first: int, count: int) -> list[str]:
     return [f"random-{'fast-' * (k % 2)}{first + k}" for k in range(count)]
 
 
-def limit_names(first: int, count: int) -> list[str]:
-    """Return names of paths at the limit of grip with seeds from `first` on, see `limit_path`."""
-    return [f"random-limit-{first + k}" for k in range(count)]
-
-
 def training_names(own: Sequence[str], seed: int, count: int) -> list[str]:
     """Return the user's own paths, or else the random ones that belong to a job's seed."""
     return list(own) or random_names(TRAINING_PATHS + MOST_PATHS * seed, count)

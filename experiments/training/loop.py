@@ -216,6 +216,7 @@ def cases(settings: TrainingSettings, policy: Path) -> list[dict[str, Any]]:
             vehicle=part.vehicle,
             vehicle_changes=part.changes,
             conditions=part.conditions,
+            **part.speed,
             seed=VALIDATION_EPISODES + k,
             control_period=settings.control_period,
             env_settings={

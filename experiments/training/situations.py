@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from experiments.jobs.job import limit_names, random_names
+from experiments.jobs.job import random_names
 from lpv_track_env import vehicle
 from lpv_track_env.vehicle import VehicleParameters
 
@@ -30,8 +30,10 @@ class Situation:
         Share of the environments, relative to the other situations.
     changes
         Fields of the vehicle that are changed.
-    limit
-        Drive paths at the limit of grip (`random-limit-SEED`) rather than usual random ones.
+    paths
+        Kind of random paths, named KIND-SEED; "random" ones are slow and fast in turn.
+    grip
+        Share of the grip that the speed is planned for; by default the paths' own speeds.
     errors
         Range of the first errors of an episode, as `initial_error_range`.
     """
@@ -40,7 +42,8 @@ class Situation:
     conditions: Any = "simulation"
     share: int = 1
     changes: Mapping[str, Any] = field(default_factory=dict)
-    limit: bool = False
+    paths: str = "random"
+    grip: float | None = None
     errors: tuple[float, float, float] = NEAR
 
     def car(self) -> VehicleParameters:
@@ -49,27 +52,35 @@ class Situation:
 
     def path_names(self, first: int, count: int) -> list[str]:
         """Return names of random paths of its kind, with seeds from `first` on."""
-        return (limit_names if self.limit else random_names)(first, count)
+        if self.paths == "random":
+            return random_names(first, count)
+        return [f"{self.paths}-{first + k}" for k in range(count)]
+
+    @property
+    def speed(self) -> dict[str, Any]:
+        """Return the arguments of an environment, or fields of a case, that choose the speed."""
+        return {} if self.grip is None else {"speed_mode": "grip", "grip": self.grip}
 
 
 _UNKNOWN = {"name": "realtime", "friction": [0.5, 1.0]}
 _SLIPPERY = {"name": "realtime", "friction": [0.5, 0.65]}
-_MINIBUS, _BMW = "m2-minibus", "bmw-320i"
+_MINIBUS, _BMW, _LIMIT = "m2-minibus", "bmw-320i", "random-limit"
 SITUATIONS: dict[str, tuple[Situation, ...]] = {
     "limits": (
         Situation(_MINIBUS, share=3),
         Situation(_MINIBUS, "realtime", share=3),
         Situation(_MINIBUS, share=4, errors=FAR),
-        Situation(_MINIBUS, "realtime", share=4, limit=True),
+        Situation(_MINIBUS, "realtime", share=4, paths=_LIMIT),
         Situation(
             _MINIBUS, "realtime", share=2, changes={"max_steering_rate": 0.15, "max_jerk": 1.5}
         ),
         Situation(_BMW),
-        Situation(_BMW, {"name": "ideal", "friction": 1.05}, share=3, limit=True),
-        Situation(_BMW, {"name": "ideal", "friction": 0.8}, share=2, limit=True),
-        Situation(_BMW, _UNKNOWN, share=3, limit=True),
-        Situation(_BMW, _SLIPPERY, share=3, limit=True),
-        Situation(_BMW, {**_SLIPPERY, "estimator": "truth"}, share=2, limit=True),
+        Situation(_BMW, {"name": "ideal", "friction": 1.05}, share=3, paths=_LIMIT),
+        Situation(_BMW, {"name": "ideal", "friction": 0.8}, share=2, paths=_LIMIT),
+        Situation(_BMW, {"name": "ideal", "friction": 1.05}, share=2, paths="circuit", grip=0.9),
+        Situation(_BMW, _UNKNOWN, share=3, paths=_LIMIT),
+        Situation(_BMW, _SLIPPERY, share=3, paths=_LIMIT),
+        Situation(_BMW, {**_SLIPPERY, "estimator": "truth"}, share=2, paths=_LIMIT),
         Situation("course-car"),
         Situation("ford-escort"),
         Situation("vw-vanagon"),

@@ -108,7 +108,7 @@ def make_learner_env(settings: TrainingSettings, paths: list[ReferencePath]) -> 
             control_period=settings.control_period, preview_steps=settings.preview_steps,
             preview_period=settings.preview_period, reward_weights=settings.reward_weights(),
             time_limit=settings.time_limit, initial_error_range=part.errors, random_start=True,
-            autoreset_mode="SameStep",
+            autoreset_mode="SameStep", **part.speed,
         )
         for part, count in zip(parts, shared_out(settings), strict=True)
     ]  # fmt: skip

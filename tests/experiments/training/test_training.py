@@ -173,7 +173,7 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
         ({"conditions": ()}, "at least one"),
         ({"envs": 1}, "envs must be at least 2"),
         ({"situations": "limit"}, "nearest: limits"),
-        ({"situations": "limits"}, "envs must be at least 33"),
+        ({"situations": "limits"}, "envs must be at least 35"),
         ({"situations": "limits", "vehicle": "course-car"}, "leave out vehicle"),
         ({"situations": "limits", "trajectories": ("circle",)}, "leave out vehicle"),
         ({"seed": 1000}, "seed"),
