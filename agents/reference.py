@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.speed_cap import SHARE, cap_speeds, capped_interval
+from lpv_track_env import observation as entry
 from lpv_track_env.observation import TrackingObservation
 from trajectories.compilation import compiled, compiled_internal
 
@@ -264,6 +265,48 @@ def approach(lateral_error: Any, speed: Any) -> tuple[Any, Any]:
         return 0.0, SHORTEST_APPROACH
     length = max(excess / APPROACH_SLOPE, APPROACH_TIME * abs(speed), SHORTEST_APPROACH)
     return math.copysign(excess, lateral_error), length
+
+
+@compiled
+def replace_previews(
+    rows: Array, period: Any, lengths: Array, rate: Any, grip: Any, braking: Any, capped: Array,
+    nodes: Array,
+) -> None:  # fmt: skip
+    """Replace the references in observations (n, size) by those that the vehicles can follow.
+
+    They are the nodes of `fill_nodes_at`, which friction allows and which lead a slow vehicle, in
+    the form of a preview of the same period. Observations that are not finite stay.
+
+    Parameters
+    ----------
+    rows
+        Observations, float64.
+    period, lengths
+        Period of their preview of K nodes, s; K times.
+    rate, grip, braking
+        As `fill_nodes_at` takes them, m/s^2.
+    capped, nodes
+        Working space, (K + 1,) and (K + 1, NODE).
+    """
+    first = entry.PREVIEW_START
+    speeds = first + lengths.shape[0]
+    for row in range(rows.shape[0]):
+        o, finite = rows[row], True
+        for value in o:
+            finite = finite and math.isfinite(value)
+        if not finite:
+            continue
+        pace = o[entry.LONGITUDINAL_SPEED] * math.cos(o[entry.HEADING_ERROR])
+        fill_nodes_at(
+            o[first:speeds], o[entry.REFERENCE_SPEED], o[speeds:], period, lengths, pace, rate,
+            grip, braking, 0.0, 1.0, capped, nodes,
+        )  # fmt: skip
+        o[entry.REFERENCE_SPEED] = nodes[0, NODE_SPEED]
+        for k in range(lengths.shape[0]):
+            length = 0.5 * (nodes[k, NODE_SPEED] + nodes[k + 1, NODE_SPEED]) * period
+            turn = nodes[k + 1, NODE_HEADING] - nodes[k, NODE_HEADING]
+            o[first + k] = turn / length if length > 1e-9 else 0.0
+            o[speeds + k] = nodes[k + 1, NODE_SPEED]
 
 
 @compiled

@@ -16,7 +16,7 @@ from agents.base import (
     checked_task,
 )
 from agents.inputs import foreign, observation_rows, started_rows
-from agents.learned.context import with_context
+from agents.learned.context import Followed, with_context
 from agents.learned.network import Network
 from agents.learned.policy import ACTIONS, Policy, read
 from agents.nmpc.rti_agent import RtiMemory, RtiNmpc, RtiRow
@@ -55,6 +55,7 @@ class LearnedPolicy:
         )  # fmt: skip
         self._size = task.layout.size
         self._network = Network.of(with_context(self.policy, task), *task.action_bounds)
+        self._followed = Followed(task) if self.policy.context else None
         self._base = RtiNmpc(task) if self.policy.origin == "lpv-nmpc" else None
         # Called with zero rows to trigger compilation here, not in the first control period.
         none = observation_rows(np.zeros((0, self._size)), self._size)
@@ -88,6 +89,8 @@ class LearnedPolicy:
         else:
             base, memory = self._base.predict(rows, state, episode_start, deterministic)  # type: ignore[arg-type]
         actions = base.astype(np.float64)
+        if self._followed is not None:
+            self._followed.replace(rows)
         if self._network.act(rows, actions):
             for row in np.flatnonzero(np.isnan(actions[:, 0])).tolist():
                 actions[row] = self._replacement(rows[row], base[row])

@@ -2,7 +2,8 @@
 
 Its values follow the observation as further inputs of the features. They do not change while an
 agent drives, so `with_context` adds what they contribute to the features' bias, once. Increments of
-the actuators' values are then shares of what the vehicle's own rates allow.
+the actuators' values are then shares of what the vehicle's own rates allow, and the features see
+the reference that the vehicle can follow (`Followed`), as the NMPC does.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import DrivingTask
+from agents.reference import NODE, replace_previews
+from agents.speed_cap import GRIP_SHARE
+from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vehicle import VehicleParameters
 
 
@@ -75,6 +79,29 @@ Scaled = TypeVar("Scaled", bound=Features)
 def context_of(names: tuple[str, ...], task: DrivingTask) -> NDArray[np.float64]:
     """Return the values of a task's context, shape (len(names),)."""
     return np.array([CONTEXT[name](task) for name in names])
+
+
+class Followed:
+    """References that the vehicle of a task can follow, in place of those of its observations.
+
+    They take `GRIP_SHARE` of the least friction, and lead the vehicle where it is slow
+    (`agents.reference.replace_previews`).
+    """
+
+    def __init__(self, task: DrivingTask) -> None:
+        layout = task.layout
+        slowest, fastest = task.vehicle.longitudinal_acceleration_range
+        grip = GRIP_SHARE * task.friction_range[0] * GRAVITY
+        self._arguments = (
+            layout.preview_period, np.full(layout.preview_steps, layout.preview_period),
+            min(fastest, grip), grip, -slowest, np.zeros(layout.preview_steps + 1),
+            np.zeros((layout.preview_steps + 1, NODE)),
+        )  # fmt: skip
+        self.replace(np.zeros((0, layout.size)))  # compiles
+
+    def replace(self, rows: NDArray[np.float64]) -> None:
+        """Replace the references in observations (n, size), in place."""
+        replace_previews(rows, *self._arguments)
 
 
 def increments(task: DrivingTask) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from agents.base import DrivingTask
 from agents.delay import DelayMemory, NearFuture
-from agents.learned.context import increments, with_context
+from agents.learned.context import Followed, increments, with_context
 from agents.learned.policy import ORIGINS, Origin, Policy
 from agents.learned.sb3_policies import network_of
 from agents.sb3 import AdapterVecEnv, TrackingVecEnv
@@ -52,8 +52,7 @@ class Scaling:
     half: NDArray[np.float64]
     """(2,) [m/s^2, rad]."""
     context: tuple[str, ...] = ()
-    """Names of the task's constants that follow, of `agents.learned.context.CONTEXT`; with it and
-    origin "actuators", the vehicle's rates replace `half`."""
+    """Names of the task's constants that follow, see `Policy`."""
 
     @property
     def features(self) -> int:
@@ -142,6 +141,7 @@ class _Part:
     def __init__(self, venv: TrackingVecEnv, scaling: Scaling, task: DrivingTask) -> None:
         self.venv, self.scaling = venv, with_context(scaling, task)
         self.solves = 0
+        self._followed = Followed(task) if scaling.context else None
         self._future = NearFuture(task, task.actuation) if task.delayed else None
         self._delays: DelayMemory | None = None
         self._base = None
@@ -188,6 +188,9 @@ class _Part:
         return self._features_of(self.observations, self.origins)
 
     def _features_of(self, observations: Array, origins: Array) -> NDArray[np.float32]:
+        if self._followed is not None:
+            observations = observations.copy()
+            self._followed.replace(observations)
         inputs = observations if self._base is None else np.hstack([observations, origins])
         return self.scaling.features_of(inputs)
 

@@ -96,7 +96,8 @@ class Policy:
         observation as u: the policy then treats left and right alike.
     context
         Names of the task's constants that the features see, of `agents.learned.context.CONTEXT`.
-        With it and origin "actuators", the vehicle's rates replace `half`.
+        With it, features see the reference that the vehicle can follow, and for origin "actuators"
+        its rates replace `half`.
 
     Raises
     ------

@@ -16,10 +16,12 @@ import lpv_track_env  # noqa: F401  registers the environments
 from agents.base import DrivingTask
 from agents.learned import Policy, read, write
 from agents.learned.agent import LearnedPolicy
-from agents.learned.context import CONTEXT, context_of, increments, with_context
+from agents.learned.context import CONTEXT, Followed, context_of, increments, with_context
 from agents.learned.learner import CONTEXT_SCALES, LearnerVecEnv, usual_scaling
+from agents.reference import local_reference
 from experiments.run.case import run_case
 from lpv_track_env import PATH_TRACKING
+from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from lpv_track_env.vehicle import VEHICLES
 from tests.helpers.learned_policies import (
@@ -83,12 +85,58 @@ def test_the_context_is_a_further_input(
 
 def test_a_policy_drives_each_vehicle_by_its_own_constants() -> None:
     policy = context_policy()
-    rows = 0.3 * observations(5)
+    rows = np.abs(0.3 * observations(5))
     one, other = (act(with_context(policy, task(**kind)), rows, np.zeros((5, 2))) for kind in KINDS)
     assert np.abs(one - other).max() > 0.1
+    followed = rows.copy()
+    Followed(task(**KINDS[1])).replace(followed)
+    other = act(with_context(policy, task(**KINDS[1])), followed, np.zeros((5, 2)))
     agent = LearnedPolicy(task(**KINDS[1]), policy)
     low, high = agent.task.action_bounds
     np.testing.assert_allclose(agent.predict(rows)[0], np.clip(other, low, high), atol=1e-6)
+
+
+def observed(path: str, speed: float | None = None, **settings: Any) -> tuple[Any, Any]:
+    """An observation on a path, with the task."""
+    env = gymnasium.make(PATH_TRACKING, trajectory=path, **settings)
+    start = {"arc_length": 20.0, **({} if speed is None else {"speed": speed})}
+    row, _ = env.reset(options=start)
+    return DrivingTask.of(env), row[None].astype(np.float64)
+
+
+def test_a_reference_that_the_vehicle_can_follow_stays_as_it_is() -> None:
+    here, rows = observed("T2")
+    seen = rows.copy()
+    Followed(here).replace(seen)
+    np.testing.assert_allclose(seen, rows, atol=1e-6)
+
+
+def test_features_see_a_reference_that_friction_allows() -> None:
+    slippery = {"name": "ideal", "friction": [0.3, 0.5]}
+    here, rows = observed("random-limit-9", vehicle="bmw-320i", conditions=slippery)
+    seen = rows.copy()
+    Followed(here).replace(seen)
+    before, after = here.layout.unpack(rows[0]), here.layout.unpack(seen[0])
+    assert (after.preview_speed <= before.preview_speed + 1e-9).all()
+    # It is the NMPC's own.
+    nodes = local_reference(
+        before, 0.1, np.full(20, 0.1), leading=2.0, grip=0.88 * 0.3 * GRAVITY, braking=4.0
+    )
+    again = local_reference(after, 0.1)
+    np.testing.assert_allclose(again.speed, nodes.speed, atol=1e-9)
+    np.testing.assert_allclose(again.heading, nodes.heading, atol=1e-9)
+
+
+def test_a_standing_vehicle_sees_a_reference_that_it_can_reach() -> None:
+    here, rows = observed("T2", speed=0.0)
+    rows = np.vstack([rows, rows])
+    rows[1, 30] = np.nan
+    seen = rows.copy()
+    Followed(here).replace(seen)
+    after = here.layout.unpack(seen[0])
+    assert after.reference_speed == pytest.approx(0.3)
+    assert after.preview_speed[-1] == pytest.approx(0.3 + 0.8 * 2.0 * 2.0)
+    np.testing.assert_array_equal(seen[1], rows[1])
 
 
 @pytest.mark.parametrize("name", VEHICLES)
