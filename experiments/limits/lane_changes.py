@@ -111,9 +111,9 @@ def _between_cones(
     """Return the problem; its extra variable is the distance beyond `PLAY` from the cones."""
     problem = ControlProblem(vehicle, friction, guess, periodic=False)
     problem.lower[:, X] = problem.upper[:, X] = guess.state[:, X]
+    problem.lower[:, PSI], problem.upper[:, PSI] = -1.0, 1.0
     start = [VY, PSI, YAW_RATE, Y]
     problem.lower[0, start] = problem.upper[0, start] = 0.0
-    problem.lower[:, PSI], problem.upper[:, PSI] = -1.0, 1.0
     problem.lower[-1, YAW_RATE], problem.upper[-1, YAW_RATE] = -END_YAW_RATE, END_YAW_RATE
     slip = problem.states[VY, -1] / problem.states[VX, -1]
     problem.require(slip, -END_SLIP, END_SLIP)
