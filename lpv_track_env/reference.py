@@ -89,9 +89,19 @@ def grip_limits(
     Top speed, acceleration, deceleration, jerk and steering rate are those of the vehicle, the
     speed at the ends of an open path and the lowest speed those of the path. `friction` is inf
     where tyres are linear.
+
+    Raises
+    ------
+    ValueError
+        If the tyres cannot overcome the rolling resistance, or braking is none of the vehicle's.
     """
     friction = friction if friction < math.inf else ORDINARY_FRICTION
-    a_max = tyres.of(car, friction)[0]
+    a_max, limit = tyres.of(car, friction)[:2]
+    if grip * limit <= car.rolling_deceleration:
+        raise ValueError(
+            f"grip {grip:g} at friction {friction:g} does not overcome the rolling resistance of "
+            f"vehicle {shown(car.name)}: at least {car.rolling_resistance / friction:.2g} does"
+        )
     slowest, fastest = car.longitudinal_acceleration_range
     corners = accelerations(car, friction, grip)
     own = path.metadata.get("limits", {})
@@ -99,8 +109,8 @@ def grip_limits(
         max_speed=car.speed_range[1],
         # That of a steady turn: more is possible only while the speed falls.
         max_lateral_acceleration=float(np.interp(0.0, *corners.T)),
-        max_acceleration=min(fastest, a_max, corners[-1, 0]),
-        max_deceleration=min(-slowest, a_max, -corners[0, 0]),
+        max_acceleration=min(fastest, a_max, float(corners[-1, 0])),
+        max_deceleration=min(-slowest, a_max, float(-corners[0, 0])),
         max_jerk=car.max_jerk,
         max_steering_rate=car.max_steering_rate,
         wheelbase=car.wheelbase,

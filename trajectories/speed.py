@@ -69,7 +69,7 @@ class SpeedLimits:
     wheelbase
         m, of the longest vehicle that the path is designed for.
     end_speed
-        m/s at both ends of an open path.
+        m/s at both ends of an open path, or less before bends that demand it.
     min_speed
         m/s; lower caps are raised to it, so that a kink slows the reference down but never stops
         it. The default is the lowest speed in the paper's constraint table.
@@ -156,7 +156,8 @@ def plan_speed(
 ) -> Array:
     """Plan the fastest jerk-limited speed profile (n,), m/s, for a `curvature` (n,), 1/m.
 
-    An open path starts and ends at `limits.end_speed`; the profile of a closed one is periodic,
+    An open path starts and ends at `limits.end_speed`, or as fast as its bends allow if that is too
+    fast for them; the profile of a closed one is periodic,
     its last node the first again.
 
     Raises
@@ -321,7 +322,8 @@ def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: bo
     m = len(caps)
     end = float(caps.min()) if closed else min(limits.end_speed**2, float(caps[0]), float(caps[-1]))
     upper = caps.copy()
-    lower = np.full(m, min(end, limits.min_speed**2))
+    lowest = min(end, limits.min_speed**2)
+    lower = np.full(m, lowest)
     # a = D b, in the cells; change of a = E b, at the nodes between two cells
     if closed:
         following = sparse.identity(m, format="csr")[np.r_[1:m, 0]]
@@ -378,6 +380,9 @@ def _plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: bo
             ),
             method="highs",
         )
+        if result.x is None and lower[0] > lowest:
+            lower[[0, -1]] = lowest
+            continue
         if result.x is None:
             raise RuntimeError(f"no speed profile found: {result.message}")
         planned = result.x[:m]

@@ -45,6 +45,9 @@ CONDITIONS: tuple[Any, ...] = (
 )  # fmt: skip
 ERROR_RANGES = ((0, 0, 0), (1, 0.3, 0.5), (1000, 6.2, 1), (1e15, 1e15, 1))
 """Of speed at most 1 m/s: no path is slower throughout."""
+SPEEDS: tuple[Settings, ...] = (
+    {"speed_mode": "variable"}, {"speed_mode": "fixed"}, {"speed_mode": "grip", "grip": 0.7},
+)  # fmt: skip
 PLANTS = ("bicycle", "single-track", "drift", "multi-body")
 PLANTED = ("ford-escort", "bmw-320i", "vw-vanagon")
 """Vehicles that every plant knows."""
@@ -77,7 +80,7 @@ def settings(rng: np.random.Generator) -> Settings:
         "time_limit": None if rng.random() < 0.3 else float(rng.uniform(1.0, 30.0)),
         "initial_error_range": ERROR_RANGES[rng.integers(len(ERROR_RANGES))],
         "random_start": bool(rng.random() < 0.7),
-        "speed_mode": str(rng.choice(["variable", "fixed"])),
+        **SPEEDS[rng.integers(len(SPEEDS))],
     }
 
 
@@ -197,7 +200,9 @@ def vector_round(seed: int, number: int, steps: int, seen: Counter[str]) -> int:
             check_infos(infos)
             seen["resets with options"] += 1
     env.close()
-    alone = PathTrackingEnv(task.path, task.vehicle, **shared | {"speed_mode": "variable"})
+    alone = PathTrackingEnv(
+        task.path, task.vehicle, **shared | {"speed_mode": "variable", "grip": None}
+    )
     replay(alone, first_seed + row, first, taken)
     seen["replayed steps"] += len(taken)
     return -(-steps // n) * n

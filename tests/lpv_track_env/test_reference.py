@@ -152,6 +152,27 @@ def test_an_open_path_begins_and_ends_at_its_own_speed() -> None:
     assert path.speed[[0, -1]] == pytest.approx([28.0, 28.0])
 
 
+@pytest.mark.parametrize("friction", [0.1, 0.3, 1.0])
+@pytest.mark.parametrize("grip", [0.1, 0.6])
+@pytest.mark.parametrize("name", ["random-limit-9", "iso-3888-1-1.61", "hairpins", "T1-raw"])
+def test_ends_are_left_as_slowly_as_the_first_bend_needs(
+    name: str, grip: float, friction: float
+) -> None:
+    path = planned(load(name), grip=grip, conditions={"name": "ideal", "friction": friction})
+    assert path.speed[[0, -1]].max() <= load(name).metadata["limits"]["end_speed"] + 1e-9
+    limits = path.metadata["limits"]
+    slow = path.speed < 1.05 * limits["min_speed"]  # a kink does not stop the reference
+    lateral = np.abs(path.curvature) * path.speed**2
+    assert lateral[~slow].max() <= 1.01 * limits["max_lateral_acceleration"]
+
+
+def test_a_grip_below_the_rolling_resistance_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"overcome the rolling resistance of vehicle .*least 0.2 "
+    ):
+        planned(grip=0.1, vehicle="m2-minibus", conditions={"name": "ideal", "friction": 0.1})
+
+
 def test_a_bend_of_a_known_curvature_is_the_bottleneck() -> None:
     limits = SpeedLimits(10.0, 2.0, 1.5)
     bend = shapes.fit(shapes.parse("S 200 | L 180 r25 | S 200"), limits)

@@ -279,6 +279,18 @@ def test_total_acceleration_keeps_within_its_circle(most: float, closed: bool) -
         dataclasses.replace(limits, max_total_acceleration=0.0)
 
 
+def test_an_end_too_fast_for_its_bend_is_slowed() -> None:
+    bend = np.where(np.abs(np.arange(401) - 100) < 40, 1 / 20.0, 0.0)
+    limits = dataclasses.replace(
+        LIMITS, end_speed=12.0, max_speed=20.0, max_jerk=1e4, max_steering_rate=1e4
+    )
+    speed = plan_speed(bend, SPACING, limits)
+    assert speed[-1] == pytest.approx(12.0)
+    # 15 m before the bend, which is taken at the root of 2 m/s^2 times 20 m.
+    assert speed[0] == pytest.approx(math.sqrt(40.0 + 2.0 * limits.deceleration * 15.0), rel=0.03)
+    assert speed[100] == pytest.approx(math.sqrt(40.0))
+
+
 def test_accelerations_keep_within_a_polygon() -> None:
     """The same drive as above, within a polygon that leaves less for accelerating in a turn."""
     s = np.arange(0.0, 400.0 + 0.5 * SPACING, SPACING)
