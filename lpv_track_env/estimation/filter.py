@@ -213,12 +213,12 @@ def update(
 @compiled_internal
 def take_reading(
     m: Array, first: int, second: int, value: Any, variance: Any, row: int, gated: int,
-    doubted: int, most: Any, settings: Array, work: Array,
+    settings: Array, work: Array,
 ) -> None:  # fmt: skip
     """Update the filter with one reading, NaN for none, and count the outcome.
 
-    After `most` rejections in a row a reading is used nevertheless: the filter is wrong, not the
-    sensor. It is then the state `doubted` that is taken to be far from its estimate.
+    After enough rejections in a row a reading is used nevertheless: the filter is wrong, not the
+    sensor.
     """
     if not math.isfinite(value):
         return
@@ -233,9 +233,9 @@ def take_reading(
         return
     m[gated] += 1.0
     m[row] += 1.0
-    if m[row] >= most:
+    if m[row] >= settings[MOST_IN_A_ROW]:
         m[row] = 0.0
-        inflate(m, doubted, innovation)
+        inflate(m, first if second < 0 else second, innovation)
         update(m, first, second, innovation, variance, math.inf, work)
 
 
@@ -250,20 +250,16 @@ def take_readings(
     m: Array, speed: Any, yaw_rate: Any, heading: Any, settings: Array, work: Array
 ) -> None:
     """Update the filter with wheel speed (m/s), yaw rate (rad/s) and heading (rad); NaN: none."""
-    s, most = settings, settings[MOST_IN_A_ROW]
+    s = settings
     m[READING_NIS] = m[READINGS] = 0.0
-    take_reading(
-        m, VX, -1, speed, s[SPEED_VARIANCE], SPEED_IN_A_ROW, SPEED_GATED, VX, most, s, work
-    )
-    # A vehicle that skids turns otherwise than its model: the second reading in a row is believed.
+    take_reading(m, VX, -1, speed, s[SPEED_VARIANCE], SPEED_IN_A_ROW, SPEED_GATED, s, work)
     take_reading(
         m, YAW_RATE, GYRO_BIAS, yaw_rate, s[YAW_RATE_VARIANCE], YAW_RATE_IN_A_ROW, YAW_RATE_GATED,
-        YAW_RATE, min(most, 2.0), s, work,
+        s, work,
     )  # fmt: skip
     take_reading(
-        m, PSI, HEADING_BIAS, heading, s[HEADING_VARIANCE], HEADING_IN_A_ROW, HEADING_GATED,
-        HEADING_BIAS, most, s, work,
-    )  # fmt: skip
+        m, PSI, HEADING_BIAS, heading, s[HEADING_VARIANCE], HEADING_IN_A_ROW, HEADING_GATED, s, work
+    )
 
 
 @compiled_internal

@@ -85,6 +85,31 @@ def test_the_filter_slides_with_the_vehicle() -> None:
         np.testing.assert_array_equal(found, tyres.of(changed.vehicle, changed.friction))
 
 
+def test_the_filter_believes_its_gyro_where_the_road_is_more_slippery_than_its_model() -> None:
+    """At the limit of friction 0.5, with a filter whose tyres have 0.75.
+
+    The model turns faster than the vehicle; were its readings gated, so would the estimate.
+    """
+    conditions = REALTIME.replace(friction=(0.5, 1.0))
+    path = trajectories.load("circle")
+    path = path.with_speed(math.sqrt(0.55 * GRAVITY / path.curvature.max()))
+    env = PathTrackingEnv(path, "bmw-320i", conditions=conditions, max_lateral_error=100.0)
+    seed = 0
+    while True:
+        env.reset(seed=seed)
+        assert env._conditioned is not None
+        if env._conditioned.vehicle[conditions_layout.FRICTION] < 0.52:
+            break
+        seed += 1
+    errors, spread = [], []
+    for step in range(100):
+        info = act(env, 0.2, min(0.005 * step, 0.15))
+        errors.append(abs(info["estimate"][YAW_RATE] - info["state"][YAW_RATE]))
+        spread.append(abs(info["state"][YAW_RATE]))
+    assert max(spread) > 0.2
+    assert max(errors) < 0.04
+
+
 def test_steering_lags_behind_a_ramp_by_its_time_constant() -> None:
     """A command that turns at the highest rate: delta(t) = w (t - T + T exp(-t/T)), sampled."""
     lag, step = 0.15, CAR.max_steering_rate * PERIOD

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from lpv_track_env import bicycle
-from lpv_track_env.bicycle import PSI, VX, X, Y
+from lpv_track_env import bicycle, tyres
+from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.estimation import filter as filtering
 from lpv_track_env.estimation.estimator import Estimator, EstimatorSettings
 from lpv_track_env.vehicle import VEHICLES
@@ -169,6 +169,14 @@ def test_prediction_covariance_is_that_of_the_model(friction: float) -> None:
             s.steering_offset_noise,
         ]
     )  # fmt: skip
+    # The noise of vy and r grows with the larger slip, by the one at which a tyre slides wholly.
+    vx, vy, _, r = before[:4]
+    front = 0.05 + offset - (vy + CAR.front_axle_distance * r) / vx
+    rear = (CAR.rear_axle_distance * r - vy) / vx
+    _, _, front_sharpness, rear_sharpness, _, _ = tyres.of(CAR, friction)
+    slip = min(max(abs(front) * front_sharpness, abs(rear) * rear_sharpness), 1.0)
+    assert (slip == 0.0) == (friction == math.inf)
+    densities[[VY, YAW_RATE]] *= 1.0 + filtering.SLIDING_NOISE * slip**2
     wanted = transition @ covariance @ transition.T + PERIOD * np.diag(densities)
     scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
     np.testing.assert_allclose(drive.filter.covariance / scale, wanted / scale, atol=1e-4)
