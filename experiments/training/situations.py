@@ -71,13 +71,14 @@ SITUATIONS: dict[str, tuple[Situation, ...]] = {
         Situation(_MINIBUS, "realtime", share=3),
         Situation(_MINIBUS, share=4, errors=FAR),
         Situation(_MINIBUS, "realtime", share=4, paths=_LIMIT),
+        Situation(_MINIBUS, {"name": "ideal", "friction": 0.9}, paths=_LIMIT),
         Situation(
             _MINIBUS, "realtime", share=2, changes={"max_steering_rate": 0.15, "max_jerk": 1.5}
         ),
         Situation(_BMW),
         Situation(_BMW, {"name": "ideal", "friction": 1.05}, share=3, paths=_LIMIT),
         Situation(_BMW, {"name": "ideal", "friction": 0.8}, share=2, paths=_LIMIT),
-        Situation(_BMW, {"name": "ideal", "friction": 1.05}, share=2, paths="circuit", grip=0.9),
+        Situation(_BMW, {"name": "ideal", "friction": 0.9}, share=2, paths="circuit", grip=0.95),
         Situation(_BMW, _UNKNOWN, share=3, paths=_LIMIT),
         Situation(_BMW, _SLIPPERY, share=3, paths=_LIMIT),
         Situation(_BMW, {**_SLIPPERY, "estimator": "truth"}, share=2, paths=_LIMIT),
