@@ -19,7 +19,7 @@ import trajectories
 from experiments.run.engines import Interrupts
 from experiments.run.folder_lock import locked
 from experiments.run.provenance import COMPUTING, computing_versions, file_digest
-from experiments.run.suites import HELD_OUT, LIMIT_PATHS, SIX
+from experiments.run.suites import CIRCUITS, HELD_OUT, LIMIT_PATHS, SIX
 from trajectories import ReferencePath
 from trajectories.arguments import shown
 from trajectories.fileio import checked, parse_json, read_bytes, read_json, write_atomically
@@ -291,5 +291,5 @@ def check_paths(own: Sequence[str], count: int, seed: int, *, verb: str) -> None
     if not 0 <= seed < 1000:
         raise ValueError(f"seed must be in [0, 999], not {seed}")
     for name in own:
-        if name.removesuffix("-raw") in (*SIX, *HELD_OUT, *LIMIT_PATHS):
+        if name.removesuffix("-raw") in (*SIX, *HELD_OUT, *LIMIT_PATHS, *CIRCUITS):
             raise ValueError(f"{name} is for evaluation: {verb} on other paths")

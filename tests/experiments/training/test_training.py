@@ -151,7 +151,7 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
     assert min(int(name.rpartition("-")[2]) for name in validated) >= VALIDATION_PATHS
     drawn = {case["seed"] for case in both}
     assert VALIDATION_EPISODES <= min(drawn) <= max(drawn) < TRAINING_EPISODES
-    for name in (*SIX, "T2-raw", *HELD_OUT):
+    for name in (*SIX, "T2-raw", *HELD_OUT, "random-limit-3", "circuit-0"):
         with pytest.raises(ValueError, match="is for evaluation"):
             tiny("ppo", trajectories=("circle", name))
 
