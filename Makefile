@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 .PHONY: help setup setup-dev setup-docs benchmark test test-fast test-lowest test-newest campaigns \
   lint docs lock clean
 help:
-	@echo "make benchmark   drive the paper's six trajectories, print the table, write results/benchmark/report.html"
+	@echo "make benchmark   drive the paper's six trajectories and the suite limits, print both tables, write results/*/report.html"
 	@echo "make test        run the tests"
 	@echo "make test-fast   run the tests that take little time"
 	@echo "make test-lowest test-newest   the same with the lowest and newest versions of all packages"
@@ -36,7 +36,7 @@ define install
 endef
 
 $(VENV)/setup.stamp: pyproject.toml requirements/run.txt | $(BIN)/python
-	$(call install,run,)
+	$(call install,run,[plants])
 	@touch $@
 
 $(VENV)/setup-dev.stamp: pyproject.toml requirements/dev.txt | $(BIN)/python
@@ -54,6 +54,7 @@ setup-docs: $(VENV)/setup-docs.stamp
 
 benchmark: setup
 	$(BIN)/lpv-track benchmark --suite paper --out results/benchmark --resume
+	$(BIN)/lpv-track benchmark --suite limits --out results/limits --resume
 
 test: setup-dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal

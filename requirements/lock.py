@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-EXTRAS: dict[str, tuple[str, ...]] = {"run": (), "dev": ("test", "dev"), "docs": ("docs",)}
+EXTRAS: dict[str, tuple[str, ...]] = {"run": ("plants",), "dev": ("test", "dev"), "docs": ("docs",)}
 """Extras of pyproject.toml in each list."""
 CUDA = re.compile(r"(nvidia|cuda|triton)\b")
 
