@@ -41,7 +41,7 @@ _HALF_G = {**_CAR, "trajectories": LIMIT_PATHS[::10]}
 _AT_055_G = {**_CAR, "trajectories": LIMIT_PATHS[1::10]}
 _LANE_CHANGE = {
     "speed_modes": ("fixed",),
-    "search": {"setting": "fixed_speed", "low": 5.0, "high": 30.0, "resolution": 0.25},
+    "search": {"setting": "fixed_speed", "low": 8.0, "high": 30.0, "resolution": 0.25},
 }
 _LANE_CHANGES = (
     {**_LANE_CHANGE, **_CAR, "trajectories": ("iso-3888-1-1.61", "iso-3888-2-1.61")},
