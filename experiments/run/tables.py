@@ -90,7 +90,7 @@ class Setting(NamedTuple):
         if changed := json.loads(self.vehicle_changes):
             parts.append(f"with {_changes(changed)}")
         speed = "" if self.fixed_speed is None else f" {self.fixed_speed} m/s"
-        grip = None if self.grip is None else f"{self.grip:g} of grip"
+        grip = None if self.grip is None else f"{self.grip} of grip"
         parts.append(grip or f"{self.speed_mode} speed{speed}")
         if self.raw:
             parts.append("raw waypoints")
