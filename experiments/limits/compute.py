@@ -54,10 +54,8 @@ def _entry_speed(
     better = (1.0 + BEYOND) * speed
 
     def beyond() -> Iterator[float]:
-        starts = [
-            motion,
-            *(lane_changes.along_the_line(path, car, share * speed) for share in (0.8, 1.02)),
-        ]
+        shares = (0.6, 0.8, 1.0)
+        starts = [lane_changes.along_the_line(path, car, share * better) for share in shares]
         for number, start in enumerate(starts, start=1):
             progress(f"{better:.2f} m/s, start {number} of {len(starts)}")
             found = lane_changes.widest(path, car, case.friction, better, start)

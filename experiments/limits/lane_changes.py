@@ -1,7 +1,5 @@
 """Highest entry speed at which a vehicle can pass the cones of a lane change."""
 
-from collections.abc import Callable
-
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +18,8 @@ PLAY = 3e-3
 """Distance from the cones that is kept at the nodes, m; so none is touched between them."""
 ROUNDS = 6
 """Most solves, each with the constraints that the headings of the last one call for."""
+SETTLED = 1e-4
+"""m by which a solution may miss the distance that it found, if it calls for other constraints."""
 END_SLIP, END_YAW_RATE = 0.1, 0.2
 """Largest |vy| / vx and yaw rate (rad/s) after the last cones: a motion that can go on."""
 
@@ -48,12 +48,14 @@ def highest_entry_speed(
     path: ReferencePath, vehicle: VehicleParameters, friction: float, guess: Motion
 ) -> Outcome:
     """Maximise the entry speed; the outcome's value is minus that speed, m/s."""
-
-    def solve(guess: Motion, *, near: bool) -> Outcome:
+    for _ in range(ROUNDS):
         problem = _between_cones(path, vehicle, friction, guess)
-        return problem.solve(-problem.states[VX, 0], near=near)
-
-    return _with_its_places(path, vehicle, guess, solve)
+        outcome = problem.solve(-problem.states[VX, 0])
+        kept = measured(path, vehicle, outcome.motion) > PLAY - SETTLED
+        if kept or not outcome.solved:
+            break
+        guess = outcome.motion
+    return outcome
 
 
 def widest(
@@ -63,28 +65,14 @@ def widest(
 
     The outcome's value is minus the distance beyond `PLAY`, m.
     """
-
-    def solve(guess: Motion, *, near: bool) -> Outcome:
+    for _ in range(ROUNDS):
         problem = _between_cones(path, vehicle, friction, guess)
         problem.lower[0, VX] = problem.upper[0, VX] = speed
         problem.extra_range = (-np.inf, np.inf)
-        return problem.solve(-problem.extra, extra=-1.0, near=near)
-
-    return _with_its_places(path, vehicle, guess, solve)
-
-
-def _with_its_places(
-    path: ReferencePath, vehicle: VehicleParameters, guess: Motion, solve: Callable[..., Outcome]
-) -> Outcome:
-    """Solve until the constraints of a guess are those of its solution."""
-    cones, corners = path.metadata["cones"], corners_of(vehicle)
-    for again in range(ROUNDS):
-        outcome = solve(guess, near=again > 0)
-        before, after = (
-            _places(cones, motion.state, corners) for motion in (guess, outcome.motion)
-        )
-        same = all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
-        if same or not outcome.solved:
+        outcome = problem.solve(-problem.extra, extra=-1.0)
+        distance = PLAY - outcome.value
+        kept = measured(path, vehicle, outcome.motion) > distance - SETTLED
+        if kept or not outcome.solved:
             break
         guess = outcome.motion
     return outcome

@@ -34,9 +34,7 @@ SLOWEST = 2.0
 LONGEST_STEP = 0.01
 """Longest Runge-Kutta step at the guess, s; at speeds above `SLOWEST` its error is below 1e-6."""
 TOLERANCE = 1e-8
-ITERATIONS = 1500
-NEAR = {"mu_init": 1e-5, "bound_push": 1e-6, "bound_frac": 1e-6}
-"""IPOPT's options for a guess that is almost the solution."""
+ITERATIONS = 600
 SMOOTHNESS = 1e-6
 """Weight of the mean squared rates of the inputs, shares of the largest ones, in the cost: without
 it a motion is not unique where nothing limits it."""
@@ -160,12 +158,10 @@ class ControlProblem:
             (flat, np.broadcast_to(low, flat.shape[0]), np.broadcast_to(high, flat.shape[0]))
         )
 
-    def solve(
-        self, cost: Any, *, extra: float = 0.0, near: bool = False, verbose: bool = False
-    ) -> Outcome:
+    def solve(self, cost: Any, *, extra: float = 0.0, verbose: bool = False) -> Outcome:
         """Minimise a cost, an expression of the problem's symbols, from the guess.
 
-        `extra` is the guess of that variable; `near` says that the guess is almost the solution.
+        `extra` is the guess of that variable.
         """
         began = time.perf_counter()
         objective, rest = cost + self._roughness, ca.vertcat(*(row[0] for row in self._rows))
@@ -180,7 +176,7 @@ class ControlProblem:
             **self._derivatives(objective, ca.vec(starts), rest),
             "ipopt": {
                 "print_level": 5 if verbose else 0, "sb": "yes", "tol": TOLERANCE,
-                "max_iter": ITERATIONS, "bound_relax_factor": 0.0, **(NEAR if near else {}),
+                "max_iter": ITERATIONS, "bound_relax_factor": 0.0,
             },
         }  # fmt: skip
         solver = ca.nlpsol("limit", "ipopt", nlp, options)

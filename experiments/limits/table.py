@@ -87,7 +87,7 @@ LANE_CHANGES = (
     LimitCase("iso-3888-1-2.0", "m2-minibus", 0.9),
     LimitCase("iso-3888-2-2.0", "m2-minibus", 0.9),
 )
-LAPS = tuple(LimitCase(f"circuit-{seed}", "bmw-320i", 0.9) for seed in range(5))
+LAPS = tuple(LimitCase(f"circuit-{seed}", "bmw-320i", 0.9) for seed in range(3))
 CASES = (*LANE_CHANGES, *LAPS)
 """Cases of the shipped table."""
 
