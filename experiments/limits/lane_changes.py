@@ -121,8 +121,8 @@ def _between_cones(
         problem.require(ca.vertcat(left - across, across - right) - problem.extra, PLAY, np.inf)
     k = cones[0].astype(int).tolist()
     for side, line in ((-1.0, cones[-2]), (1.0, cones[-1])):
-        aside = c[k] * (line - y[k]) - s[k] * (cones[1] - x[k])
-        problem.require(side * aside - half - problem.extra, PLAY, np.inf)
+        flank = y[k] + ((cones[1] - x[k]) * s[k] + side * half) / c[k]
+        problem.require(side * (line - flank) - problem.extra, PLAY, np.inf)
     return problem
 
 
