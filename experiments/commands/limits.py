@@ -12,14 +12,14 @@ from experiments.commands import options as shared
 from experiments.commands.options import EXIT_FAILED, EXIT_INTERRUPTED, file_name
 
 if TYPE_CHECKING:
-    from experiments.limits import Limit, LimitCase
+    from experiments.run.physical_limits import Limit, LimitCase
 
 EXAMPLE = "lpv-track limits iso-3888-2-1.61 --vehicle bmw-320i --friction 0.9 --draw limits"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    from experiments.limits.table import CORRIDOR
+    from experiments.run.physical_limits import CORRIDOR
 
     parser.add_argument(
         "paths", nargs="*", metavar="PATH",
@@ -45,7 +45,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     0: each limit has passed its checks; 1: one has not; 130: Ctrl-C, the table holds what was done.
     """
-    from experiments.limits.table import CASES, LimitCase, read
+    from experiments.run.physical_limits import CASES, LimitCase, read
 
     cases: Sequence[LimitCase] = CASES
     if options.paths:
@@ -73,9 +73,9 @@ def _compute_all(
     import trajectories
     from experiments.limits.compute import compute
     from experiments.limits.figures import draw
-    from experiments.limits.table import digest, write
     from experiments.run.benchmark import progress_bar
     from experiments.run.engines import Interrupts
+    from experiments.run.physical_limits import digest, write
     from trajectories.fileio import file_name as safe
 
     try:
@@ -107,7 +107,7 @@ def _compute_all(
 
 def table(limits: "Sequence[Limit]") -> Table:
     """Return the console's table of limits."""
-    from experiments.limits.table import BEYOND
+    from experiments.run.physical_limits import BEYOND
 
     shown = Table(
         title="Physical limits", title_justify="left", caption_justify="left",

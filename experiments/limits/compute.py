@@ -6,7 +6,7 @@ from typing import NamedTuple
 import trajectories
 from experiments.limits import lane_changes, laps
 from experiments.limits.optimal_control import Motion, Outcome
-from experiments.limits.table import BEYOND, Limit, LimitCase, digest
+from experiments.run.physical_limits import BEYOND, Limit, LimitCase, digest
 from lpv_track_env import vehicle
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath

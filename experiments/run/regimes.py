@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from agents.weight_tuning.score import SCALES
-from experiments import limits
+from experiments.run import physical_limits
 from experiments.run.search import passes
 from experiments.run.statistics import rate_interval
 from experiments.run.tables import Result, by_label, ordered
@@ -150,7 +150,7 @@ def possible(case: Result) -> float | None:
     friction = conditions.get("friction") if isinstance(conditions, Mapping) else None
     if not isinstance(friction, float):
         return None
-    limit = limits.limit_of(str(case["trajectory"]), str(case["vehicle"]), friction)
+    limit = physical_limits.limit_of(str(case["trajectory"]), str(case["vehicle"]), friction)
     if limit is None:
         return None
     if "fastest_lap" in found:

@@ -52,7 +52,7 @@ _LAPS = {
     "search": {"setting": "grip", "low": 0.4, "high": 1.2, "resolution": 0.01},
 }  # fmt: skip
 DRY = {"name": "ideal", "friction": 0.9}
-"""Ideal conditions of the lane changes and laps, for which `experiments.limits` has the limits."""
+"""Ideal conditions of the lane changes and laps, whose limits `physical_limits` has."""
 _KNOWN = {**_TRUTH, "friction": 0.9}
 
 

@@ -10,9 +10,11 @@ import pytest
 
 import trajectories
 from experiments.cli import main
-from experiments.limits import Limit, LimitCase, compute, lane_changes, laps, limit_of, table
+from experiments.limits import compute, lane_changes, laps
 from experiments.limits.compute import Found
 from experiments.limits.figures import draw
+from experiments.run import physical_limits as table
+from experiments.run.physical_limits import Limit, LimitCase, limit_of
 from lpv_track_env.bicycle import VX
 from lpv_track_env.vehicle import load
 

@@ -92,7 +92,7 @@ def test_searches_show_what_is_reached_and_what_is_possible(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     known = {"iso": 20.0, "lap": 30.0}
-    monkeypatch.setattr(regimes.limits, "limit_of", lambda path, *_: known.get(path))
+    monkeypatch.setattr(regimes.physical_limits, "limit_of", lambda path, *_: known.get(path))
     entry = {"regime": "a", "search": {"setting": "fixed_speed"}}
     lap = {"regime": "b", "search": {"setting": "grip"}, "conditions": {"friction": 0.9}}
     cases = [

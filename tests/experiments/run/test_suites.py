@@ -9,8 +9,8 @@ import pytest
 import agents
 import trajectories
 from experiments.jobs.job import TRAINING_PATHS, VALIDATION_PATHS
-from experiments.limits import limit_of
 from experiments.run.case import Case
+from experiments.run.physical_limits import limit_of
 from experiments.run.suites import (
     BESIDE,
     DEMONSTRATION,

@@ -13,7 +13,7 @@ from experiments.run.provenance import command_line, provenance
 from trajectories import ReferencePath
 from trajectories.fileio import checked, read_json, write_atomically
 
-SHIPPED = Path(__file__).parent / "data" / "limits.json"
+SHIPPED = Path(__file__).parents[1] / "limits" / "data" / "limits.json"
 FORMAT = "lpv-track-limits/1"
 CORRIDOR = 0.5
 """Half width of the corridor of a lap, m."""
