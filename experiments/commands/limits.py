@@ -34,6 +34,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="largest lateral error of a lap, m; default: %(default)s",
     )  # fmt: skip
     parser.add_argument(
+        "--kept", type=shared.number(0.0, 1.0), default=0.0, metavar="SHARE",
+        help="share of the entry speed that must be kept on a lane change; default: %(default)s",
+    )  # fmt: skip
+    parser.add_argument(
         "--out", type=file_name, metavar="FILE",
         help="JSON table; cases that it holds already, of the same paths, are not computed again",
     )  # fmt: skip
@@ -50,7 +54,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     cases: Sequence[LimitCase] = CASES
     if options.paths:
         cases = [
-            LimitCase(path, options.vehicle, options.friction, options.corridor)
+            LimitCase(path, options.vehicle, options.friction, options.corridor, options.kept)
             for path in options.paths
         ]
     done = read(options.out) if options.out is not None and options.out.is_file() else []
@@ -91,12 +95,17 @@ def _compute_all(
                 now = digest(trajectories.load(case.path))
                 kept = [one for one in done if (one.case, one.path_digest) == (case, now)]
                 if not kept or folder is not None:
-                    found = compute(case, note)
+                    try:
+                        found = compute(case, note)
+                    except RuntimeError as error:
+                        interrupts.check()  # CasADi takes Ctrl-C for a failed solve
+                        raise ValueError(error) from None
                     interrupts.check()
                     done[:] = [one for one in done if one.case != case] + [found.limit]
                     if folder is not None:
                         folder.mkdir(parents=True, exist_ok=True)
-                        draw(found, folder / f"{safe(f'{case.path}-{case.vehicle}')}.png")
+                        name = safe(f"{case.path}-{case.vehicle}-{case.kept:g}")
+                        draw(found, folder / f"{name}.png")
                     if out is not None:
                         write(done, out)
                 progress.advance(bar)
@@ -112,20 +121,30 @@ def table(limits: "Sequence[Limit]") -> Table:
     shown = Table(
         title="Physical limits", title_justify="left", caption_justify="left",
         caption=(
-            "replay: distance from the cones, or largest lateral error, of the inputs driven anew. "
+            "kept: least share of the entry speed later on. replay: distance from the cones, or "
+            "largest lateral error, of the inputs driven anew. "
             f"{100 * BEYOND:g} % better: the largest distance from the cones, or the narrowest "
             "corridor, that was found from all starts at so much more speed or less time."
         ),
     )  # fmt: skip
     shown.add_column("path", no_wrap=True)
     shown.add_column("vehicle", no_wrap=True)
-    for heading in ("friction", "limit", "replay m", f"{100 * BEYOND:g} % better m", "solve s"):
+    for heading in (
+        "friction",
+        "kept",
+        "limit",
+        "replay m",
+        f"{100 * BEYOND:g} % better m",
+        "solve s",
+    ):
         shown.add_column(heading, justify="right", no_wrap=True)
     shown.add_column("shown")
     for one in limits:
         unit = "m/s" if one.kind == "entry speed" else "s"
+        kept = f"{100 * one.case.kept:g} %" if one.kind == "entry speed" else ""
         shown.add_row(
-            one.case.path, one.case.vehicle, f"{one.case.friction:g}", f"{one.value:.3f} {unit}",
+            one.case.path, one.case.vehicle, f"{one.case.friction:g}", kept,
+            f"{one.value:.3f} {unit}",
             f"{one.replayed:.4f}", f"{one.beyond:.4f}", f"{one.seconds:.0f}",
             "yes" if one.shown else "no",
         )  # fmt: skip

@@ -46,7 +46,7 @@ def _entry_speed(
     progress("highest entry speed")
     for start in (16.0, 12.0, 22.0, 8.0):
         guess = lane_changes.along_the_line(path, car, start)
-        outcome = lane_changes.highest_entry_speed(path, car, case.friction, guess)
+        outcome = lane_changes.highest_entry_speed(path, car, case.friction, case.kept, guess)
         if outcome.solved:
             break
     motion = _motion(case, outcome)
@@ -58,7 +58,7 @@ def _entry_speed(
         starts = [lane_changes.along_the_line(path, car, share * better) for share in shares]
         for number, start in enumerate(starts, start=1):
             progress(f"{better:.2f} m/s, start {number} of {len(starts)}")
-            found = lane_changes.widest(path, car, case.friction, better, start)
+            found = lane_changes.widest(path, car, case.friction, case.kept, better, start)
             if found.solved:
                 yield lane_changes.PLAY - found.value
 

@@ -45,11 +45,14 @@ def along_the_line(path: ReferencePath, vehicle: VehicleParameters, speed: float
 
 
 def highest_entry_speed(
-    path: ReferencePath, vehicle: VehicleParameters, friction: float, guess: Motion
+    path: ReferencePath, vehicle: VehicleParameters, friction: float, kept: float, guess: Motion
 ) -> Outcome:
-    """Maximise the entry speed; the outcome's value is minus that speed, m/s."""
+    """Maximise the entry speed; the outcome's value is minus that speed, m/s.
+
+    The vehicle keeps at least the share `kept` of it.
+    """
     for _ in range(ROUNDS):
-        problem = _between_cones(path, vehicle, friction, guess)
+        problem = _between_cones(path, vehicle, friction, guess, kept)
         outcome = problem.solve(-problem.states[VX, 0])
         kept = measured(path, vehicle, outcome.motion) > PLAY - SETTLED
         if kept or not outcome.solved:
@@ -59,14 +62,15 @@ def highest_entry_speed(
 
 
 def widest(
-    path: ReferencePath, vehicle: VehicleParameters, friction: float, speed: float, guess: Motion
-) -> Outcome:
+    path: ReferencePath, vehicle: VehicleParameters, friction: float, kept: float, speed: float,
+    guess: Motion,
+) -> Outcome:  # fmt: skip
     """Maximise the distance from the cones at an entry speed (m/s).
 
     The outcome's value is minus the distance beyond `PLAY`, m.
     """
     for _ in range(ROUNDS):
-        problem = _between_cones(path, vehicle, friction, guess)
+        problem = _between_cones(path, vehicle, friction, guess, kept)
         problem.lower[0, VX] = problem.upper[0, VX] = speed
         problem.extra_range = (-np.inf, np.inf)
         outcome = problem.solve(-problem.extra, extra=-1.0)
@@ -94,7 +98,7 @@ def replayed_clearance(
 
 
 def _between_cones(
-    path: ReferencePath, vehicle: VehicleParameters, friction: float, guess: Motion
+    path: ReferencePath, vehicle: VehicleParameters, friction: float, guess: Motion, kept: float
 ) -> ControlProblem:
     """Return the problem; its extra variable is the distance beyond `PLAY` from the cones."""
     problem = ControlProblem(vehicle, friction, guess, periodic=False)
@@ -105,6 +109,9 @@ def _between_cones(
     problem.lower[-1, YAW_RATE], problem.upper[-1, YAW_RATE] = -END_YAW_RATE, END_YAW_RATE
     slip = problem.states[VY, -1] / problem.states[VX, -1]
     problem.require(slip, -END_SLIP, END_SLIP)
+    speeds = problem.states[VX, :]
+    if kept > 0.0:
+        problem.require(speeds[1:] - kept * speeds[0], 0.0, np.inf)
     x, y, psi = (problem.states[k, :].T for k in (X, Y, PSI))
     c, s, half = ca.cos(psi), ca.sin(psi), 0.5 * vehicle.width
     corners, crossings, cones = _places(path.metadata["cones"], guess.state, corners_of(vehicle))

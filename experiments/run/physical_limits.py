@@ -22,12 +22,17 @@ BEYOND = 0.02
 
 
 class LimitCase(msgspec.Struct, frozen=True, order=True):
-    """A path, a vehicle and a friction; `corridor` (m) counts for laps only."""
+    """A path, a vehicle and a friction.
+
+    `corridor` (m) counts for laps only. `kept` counts for lane changes only: the share of the entry
+    speed that the vehicle must keep; 0 lets it brake as it likes.
+    """
 
     path: str
     vehicle: str
     friction: float
     corridor: float = CORRIDOR
+    kept: float = 0.0
 
 
 class Limit(msgspec.Struct, frozen=True):
@@ -87,8 +92,10 @@ LANE_CHANGES = (
     LimitCase("iso-3888-1-2.0", "m2-minibus", 0.9),
     LimitCase("iso-3888-2-2.0", "m2-minibus", 0.9),
 )
+HELD = tuple(msgspec.structs.replace(case, kept=0.95) for case in LANE_CHANGES)
+"""The same at almost constant speed."""
 LAPS = tuple(LimitCase(f"circuit-{seed}", "bmw-320i", 0.9) for seed in range(3))
-CASES = (*LANE_CHANGES, *LAPS)
+CASES = (*LANE_CHANGES, *HELD, *LAPS)
 """Cases of the shipped table."""
 
 
@@ -129,16 +136,18 @@ def _shipped() -> Sequence[Limit]:
     return read() if SHIPPED.is_file() else []
 
 
-def limit_of(path: str, vehicle: str, friction: float, corridor: float = CORRIDOR) -> float | None:
+def limit_of(
+    path: str, vehicle: str, friction: float, corridor: float = CORRIDOR, kept: float = 0.0
+) -> float | None:
     """Return the shipped limit of a case: entry speed (m/s) or lap time (s); None if unknown.
 
-    `corridor` (m) counts for laps only.
+    `corridor` (m) counts for laps only, `kept`, see `LimitCase`, for lane changes only.
     """
     for limit in _shipped():
         case = limit.case
-        given = case.path, case.vehicle, case.friction
-        wide = limit.kind == "entry speed" or case.corridor == corridor
-        if wide and _same_path(given[0], path) and given[1:] == (vehicle, friction):
+        same = case.kept == kept if limit.kind == "entry speed" else case.corridor == corridor
+        named = _same_path(case.path, path) and case.vehicle == vehicle
+        if same and named and case.friction == friction:
             return limit.value
     return None
 

@@ -75,6 +75,9 @@ def test_limits_are_looked_up() -> None:
     assert limit_of("iso-3888-1-2", "m2-minibus", 0.9) == limit_of(
         "iso-3888-1-2.0", "m2-minibus", 0.9, corridor=3.0
     )
+    held = limit_of("iso-3888-2-1.61", "bmw-320i", 0.9, kept=0.95)
+    assert held is not None
+    assert 0.9 < held / 21.316 < 1.0
     lap = table.LAPS[0]
     assert limit_of(lap.path, lap.vehicle, lap.friction, 0.4) is None
     assert limit_of("iso-3888-2-1.61", "bmw-320i", 0.8) is None
