@@ -70,7 +70,8 @@ SITUATIONS: dict[str, tuple[Situation, ...]] = {
         Situation(_MINIBUS, share=3),
         Situation(_MINIBUS, "realtime", share=3),
         Situation(_MINIBUS, share=4, errors=FAR),
-        Situation(_MINIBUS, "realtime", share=4, paths=_LIMIT),
+        Situation(_MINIBUS, "realtime", share=3, paths=_LIMIT),
+        Situation(_MINIBUS, "realtime", share=4, paths="random-fast", grip=0.55),
         Situation(_MINIBUS, {"name": "ideal", "friction": 0.9}, paths=_LIMIT),
         Situation(
             _MINIBUS, "realtime", share=2, changes={"max_steering_rate": 0.15, "max_jerk": 1.5}

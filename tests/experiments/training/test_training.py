@@ -60,7 +60,7 @@ def tiny(algorithm: str, **changes: Any) -> TrainingSettings:
 
 
 def mixed(**changes: Any) -> TrainingSettings:
-    return tiny("bc", situations="limits", envs=72, steps=4000, **changes)
+    return tiny("bc", situations="limits", envs=78, steps=4000, **changes)
 
 
 def silent(*_: Any) -> None:
@@ -173,7 +173,7 @@ def test_no_training_sees_what_is_evaluated(tmp_path: Path) -> None:
         ({"conditions": ()}, "at least one"),
         ({"envs": 1}, "envs must be at least 2"),
         ({"situations": "limit"}, "nearest: limits"),
-        ({"situations": "limits"}, "envs must be at least 36"),
+        ({"situations": "limits"}, "envs must be at least 39"),
         ({"situations": "limits", "vehicle": "course-car"}, "leave out vehicle"),
         ({"situations": "limits", "trajectories": ("circle",)}, "leave out vehicle"),
         ({"seed": 1000}, "seed"),
@@ -227,7 +227,7 @@ def test_a_training_mixes_situations(tmp_path: Path) -> None:
     trainer = make_trainer(settings, load_paths(path_names(settings)), Logger(None, []))
     sizes = [rows.stop - rows.start for rows in trainer.env.rows]
     shares = [part.share for part in settings.parts]
-    assert sum(sizes) == 72
+    assert sum(sizes) == 78
     assert all(size // share >= 2 for size, share in zip(sizes, shares, strict=True))
     for part, task in zip(settings.parts, trainer.env.tasks, strict=True):
         assert task.vehicle == part.car()
