@@ -6,7 +6,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.limits.optimal_control import ControlProblem, Motion, Outcome, replay
+from experiments.limits.optimal_control import (
+    ControlProblem,
+    Motion,
+    Outcome,
+    replay_steps,
+    steadied_replay,
+)
 from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vehicle import VehicleParameters
@@ -20,6 +26,10 @@ GUESS_GRIP = 0.75
 """Share of the friction that the first guess uses."""
 INSIDE = 5e-3
 """m by which the nodes keep within the corridor; so the motion does between them."""
+
+
+CORRECTION = 1e-4
+"""Most that a replay's feedback may change the inputs, m/s^2 and rad."""
 
 
 def quasi_static(path: ReferencePath, vehicle: VehicleParameters, friction: float) -> Motion:
@@ -93,8 +103,18 @@ def largest_error(path: ReferencePath, motion: Motion) -> float:
 def replayed_error(
     path: ReferencePath, vehicle: VehicleParameters, friction: float, motion: Motion
 ) -> float:
-    """Return `largest_error` of a motion's inputs, driven anew by the environment's integrator."""
-    return largest_error(path, replay(motion, vehicle, friction))
+    """Return `largest_error` of a motion driven anew by the environment's integrator, m.
+
+    Raises
+    ------
+    RuntimeError
+        If the feedback that keeps it steady changes an input by more than `CORRECTION`.
+    """
+    again = steadied_replay(motion, vehicle, friction)
+    change = np.abs(again.inputs[:: replay_steps(motion, vehicle)] - motion.inputs).max()
+    if change > CORRECTION:
+        raise RuntimeError(f"path {path.name}: a replay needs corrections of {change:.2g}")
+    return largest_error(path, again)
 
 
 def _lap(

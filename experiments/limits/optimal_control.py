@@ -10,8 +10,9 @@ them: what is found no controller can surpass on this plant, save for other loca
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -23,6 +24,7 @@ from lpv_track_env.bicycle import (
     STATE_SIZE,
     VX,
     casadi_derivative,
+    longest_substep,
 )
 from lpv_track_env.integration import integrate_with
 from lpv_track_env.vehicle import VehicleParameters
@@ -45,15 +47,11 @@ STATE_COLUMN, INPUT_COLUMN = slice(0, STATE_SIZE), slice(STATE_SIZE, STATE_SIZE 
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion of n intervals: their lengths (n,) s, states (n + 1, 6) and inputs (n, 2).
-
-    `substeps` is the number of Runge-Kutta steps in each interval.
-    """
+    """A motion of n intervals: their lengths (n,) s, states (n + 1, 6) and inputs (n, 2)."""
 
     steps: Array
     state: Array
     inputs: Array
-    substeps: int = 1
 
     @property
     def time(self) -> Array:
@@ -239,23 +237,63 @@ class ControlProblem:
     def _unpacked(self, values: Array) -> Motion:
         whole = np.concatenate([values, np.zeros(ACTION_SIZE + 1)])
         rows = whole.reshape(-1, len(self._scale)) * self._scale
-        state, inputs = rows[:, STATE_COLUMN], rows[:-1, INPUT_COLUMN]
-        return Motion(rows[:-1, -1], state, inputs, self.substeps)
+        return Motion(rows[:-1, -1], rows[:, STATE_COLUMN], rows[:-1, INPUT_COLUMN])
+
+
+def replay_steps(motion: Motion, vehicle: VehicleParameters) -> int:
+    """Return the number of Runge-Kutta steps in each interval of a replay, none too long."""
+    return math.ceil(float(motion.steps.max()) / longest_substep(vehicle) - 1e-9)
 
 
 def replay(motion: Motion, vehicle: VehicleParameters, friction: float) -> Motion:
     """Return a motion with the same inputs from the same start, by the environment's integrator.
 
-    Its Runge-Kutta steps are those of the motion; they are the intervals of the result. Over a lap
-    at the limit a vehicle is unstable: steps of other lengths, which give the same state after an
-    interval to 1e-5, would end elsewhere.
+    Its steps, of the environment's length, are the intervals of the result.
     """
-    integrate: Any = integrate_with
+    return _driven(motion, vehicle, friction, np.zeros((len(motion.steps), 2, STATE_SIZE)))
+
+
+def steadied_replay(motion: Motion, vehicle: VehicleParameters, friction: float) -> Motion:
+    """Return what `replay` does, with a linear feedback of the distance from the motion.
+
+    A vehicle at the limit is unstable: in open loop, rounding errors grow to decimetres over a lap.
+    The gains are those of the linear-quadratic regulator about the motion; what they add to the
+    inputs is the difference from the motion's.
+    """
+    integrate, count = _integrator(vehicle, friction), replay_steps(motion, vehicle)
+    unit = np.concatenate([SCALE[STATE_COLUMN], SCALE[INPUT_COLUMN]])
+    offsets = 1e-6 * np.diag(unit)
+    cost = np.diag(1.0 / SCALE[STATE_COLUMN] ** 2)
+    price = np.diag(1.0 / SCALE[INPUT_COLUMN] ** 2)
+    gains = np.zeros((len(motion.steps), ACTION_SIZE, STATE_SIZE))
+    to_go = cost
+    for k in range(len(motion.steps) - 1, -1, -1):
+        at, h = np.append(motion.state[k], motion.inputs[k]), motion.steps[k] / count
+
+        def end(values: Array, h: float = h) -> Array:
+            return np.array(integrate(values, h, count))
+
+        slopes = [(end(at + d) - end(at - d)) / (2.0 * d.sum()) for d in offsets]
+        a, b = np.array(slopes[:STATE_SIZE]).T, np.array(slopes[STATE_SIZE:]).T
+        gains[k] = np.linalg.solve(price + b.T @ to_go @ b, b.T @ to_go @ a)
+        to_go = cost + a.T @ to_go @ (a - b @ gains[k])
+    return _driven(motion, vehicle, friction, gains)
+
+
+def _driven(motion: Motion, vehicle: VehicleParameters, friction: float, gains: Array) -> Motion:
+    """Return the motion that the integrator makes of inputs less gains times deviations."""
+    integrate, count = _integrator(vehicle, friction), replay_steps(motion, vehicle)
+    states, inputs = [motion.state[0]], []
+    for k, step in enumerate(motion.steps):
+        held = motion.inputs[k] - gains[k] @ (states[-1] - motion.state[k])
+        for _ in range(count):
+            inputs.append(held)
+            states.append(np.array(integrate(np.append(states[-1], held), step / count, 1)))
+    return Motion(np.repeat(motion.steps / count, count), np.array(states), np.array(inputs))
+
+
+def _integrator(vehicle: VehicleParameters, friction: float) -> Callable[[Array, float, int], Any]:
+    """Return the environment's integrator: state and inputs (8,), step in s, number of steps."""
     tyre = np.array(tyres.of(vehicle, friction))
-    parameters = vehicle.as_array().tolist()
-    steps = np.repeat(motion.steps / motion.substeps, motion.substeps)
-    inputs = np.repeat(motion.inputs, motion.substeps, axis=0)
-    states = [motion.state[0].tolist()]
-    for (a, delta), h in zip(inputs.tolist(), steps.tolist(), strict=True):
-        states.append(list(integrate(*states[-1], a, delta, *parameters, tyre, h, 1)))
-    return Motion(steps, np.array(states), inputs)
+    parameters, compiled = vehicle.as_array().tolist(), cast("Any", integrate_with)
+    return lambda at, h, count: compiled(*at.tolist(), *parameters, tyre, h, count)

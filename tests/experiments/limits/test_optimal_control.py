@@ -8,8 +8,15 @@ import pytest
 from scipy.optimize import minimize
 
 from experiments.limits import laps
-from experiments.limits.optimal_control import ControlProblem, Motion, Outcome, replay
-from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, derivative
+from experiments.limits.optimal_control import (
+    ControlProblem,
+    Motion,
+    Outcome,
+    replay,
+    replay_steps,
+    steadied_replay,
+)
+from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y, derivative, longest_substep
 from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vehicle import load
 from trajectories import load as load_path
@@ -92,8 +99,21 @@ def test_a_lap_of_a_circle_is_the_fastest_steady_turn(monkeypatch: pytest.Monkey
 def test_a_replay_takes_the_environments_steps() -> None:
     outcome = sprint(0.9)
     motion = outcome.motion
-    again = replay(motion, CAR, 0.9)
-    assert len(again.steps) == len(motion.steps) * motion.substeps
-    np.testing.assert_allclose(again.state[:: motion.substeps], motion.state, atol=1e-6)
-    assert again.time[-1] == pytest.approx(outcome.value, abs=1e-9)
-    assert again.state[-1, [VY, PSI, Y]] == pytest.approx(np.zeros(3), abs=1e-6)
+    for again in (replay(motion, CAR, 0.9), steadied_replay(motion, CAR, 0.9)):
+        steps = replay_steps(motion, CAR)
+        assert again.steps.max() <= longest_substep(CAR) + 1e-9
+        np.testing.assert_allclose(again.state[::steps], motion.state, atol=1e-5)
+        np.testing.assert_allclose(again.inputs[::steps], motion.inputs, atol=1e-5)
+        assert again.time[-1] == pytest.approx(outcome.value, abs=1e-9)
+        assert again.state[-1, [VY, PSI, Y]] == pytest.approx(np.zeros(3), abs=1e-6)
+
+
+def test_the_feedback_of_a_replay_leads_back() -> None:
+    """From 1 cm beside the start, a sprint in open loop stays beside; steadied it comes back."""
+    motion = sprint(0.9, distance=80.0).motion
+    state = motion.state.copy()
+    state[0, Y] = 0.01
+    beside = Motion(motion.steps, state, motion.inputs)
+    assert replay(beside, CAR, 0.9).state[-1, Y] == pytest.approx(0.01, abs=1e-6)
+    # All nodes but the first are those of the sprint.
+    assert abs(steadied_replay(beside, CAR, 0.9).state[-1, Y]) < 2e-3
