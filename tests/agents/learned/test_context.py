@@ -139,6 +139,20 @@ def test_a_standing_vehicle_sees_a_reference_that_it_can_reach() -> None:
     np.testing.assert_array_equal(seen[1], rows[1])
 
 
+def test_an_agent_with_a_context_answers_any_numbers() -> None:
+    here = task(**KINDS[1])
+    agent = LearnedPolicy(here, context_policy("actuators"))
+    rng, bound = np.random.default_rng(3), here.layout.bound.astype(np.float64)
+    rows = rng.uniform(-1.0, 1.0, (400, here.layout.size)) * bound
+    rows[::2] = 0.0
+    rows[::4, rng.integers(0, here.layout.size, 100)] = 1e300
+    rows[1::8, 5] = np.nan
+    actions = agent.predict(rows)[0]
+    low, high = here.action_bounds
+    assert np.isfinite(actions).all()
+    assert ((low <= actions) & (actions <= high)).all()
+
+
 @pytest.mark.parametrize("name", VEHICLES)
 def test_what_the_context_says_of_a_vehicle(name: str) -> None:
     here = task(vehicle=name)

@@ -323,5 +323,5 @@ def test_another_vehicle_than_in_training_is_said_in_the_result(tmp_path: Path) 
     (said,) = run_case({**spec, "vehicle": "course-car"})["warnings"]
     assert "was trained for vehicle 'm2-minibus', not for 'course-car'" in said
     # A shipped policy's own folder would make results differ from installation to installation.
-    (said,) = run_case({**spec, "agent": "ppo", "vehicle": "course-car"})["warnings"]
-    assert said == "policy ppo.json was trained for vehicle 'm2-minibus', not for 'course-car'"
+    (said,) = run_case({**spec, "agent": "sac", "vehicle": "course-car"})["warnings"]
+    assert said == "policy sac.json was trained for vehicle 'm2-minibus', not for 'course-car'"
