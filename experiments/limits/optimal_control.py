@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -28,6 +28,7 @@ from lpv_track_env.bicycle import (
 )
 from lpv_track_env.integration import integrate_with
 from lpv_track_env.vehicle import VehicleParameters
+from trajectories.compilation import compiled
 
 Array = NDArray[np.float64]
 
@@ -271,7 +272,7 @@ def steadied_replay(motion: Motion, vehicle: VehicleParameters, friction: float)
         at, h = np.append(motion.state[k], motion.inputs[k]), motion.steps[k] / count
 
         def end(values: Array, h: float = h) -> Array:
-            return np.array(integrate(values, h, count))
+            return integrate(values, h, count)
 
         slopes = [(end(at + d) - end(at - d)) / (2.0 * d.sum()) for d in offsets]
         a, b = np.array(slopes[:STATE_SIZE]).T, np.array(slopes[STATE_SIZE:]).T
@@ -288,12 +289,28 @@ def _driven(motion: Motion, vehicle: VehicleParameters, friction: float, gains: 
         held = motion.inputs[k] - gains[k] @ (states[-1] - motion.state[k])
         for _ in range(count):
             inputs.append(held)
-            states.append(np.array(integrate(np.append(states[-1], held), step / count, 1)))
+            states.append(integrate(np.append(states[-1], held), step / count, 1))
     return Motion(np.repeat(motion.steps / count, count), np.array(states), np.array(inputs))
 
 
-def _integrator(vehicle: VehicleParameters, friction: float) -> Callable[[Array, float, int], Any]:
+def _integrator(
+    vehicle: VehicleParameters, friction: float
+) -> Callable[[Array, float, int], Array]:
     """Return the environment's integrator: state and inputs (8,), step in s, number of steps."""
-    tyre = np.array(tyres.of(vehicle, friction))
-    parameters, compiled = vehicle.as_array().tolist(), cast("Any", integrate_with)
-    return lambda at, h, count: compiled(*at.tolist(), *parameters, tyre, h, count)
+    tyre, parameters = np.array(tyres.of(vehicle, friction)), vehicle.as_array()
+
+    def integrated(at: Array, h: float, count: int) -> Array:
+        after = np.empty(STATE_SIZE)
+        _integrate(at, parameters, tyre, h, count, after)
+        return after
+
+    return integrated
+
+
+@compiled
+def _integrate(at: Array, p: Array, tyre: Array, h: float, count: int, after: Array) -> None:
+    """Write the state (6,) that `count` steps of h seconds lead to, from state and inputs (8,)."""
+    after[0], after[1], after[2], after[3], after[4], after[5] = integrate_with(
+        at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7],
+        p[0], p[1], p[2], p[3], p[4], p[5], p[6], tyre, h, count,
+    )  # fmt: skip
