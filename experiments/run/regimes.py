@@ -53,8 +53,6 @@ SEARCHED = {
     ),
 }  # fmt: skip
 """The same by the setting that is searched for."""
-FOR_CONTROLLERS = ("longitudinal_acceleration_range", "max_lateral_velocity_ratio")
-"""Fields of a vehicle that bound what controllers ask for, not what it can do."""
 COUNTS = ("agent", "drives", "failed", "95 %")
 NOTE = (
     "A drive fails unless it reaches the end of the path; beside the failures stands the "
@@ -150,8 +148,7 @@ def possible(case: Result) -> float | None:
     """
     conditions, found = case.get("conditions"), case["metrics"]
     friction = conditions.get("friction") if isinstance(conditions, Mapping) else None
-    other = set(case.get("vehicle_changes") or ()) - set(FOR_CONTROLLERS)
-    if other or not isinstance(friction, float):
+    if case.get("vehicle_changes") or not isinstance(friction, float):
         return None
     limit = physical_limits.limit_of(str(case["trajectory"]), str(case["vehicle"]), friction)
     if limit is None:

@@ -49,8 +49,6 @@ _LANE_CHANGES = (
 )
 _LAPS = {
     **_BY_GRIP, "env_settings": {"max_lateral_error": 0.5},
-    # All that the actuators can, as in the optimal control problem.
-    "vehicle_changes": {"longitudinal_acceleration_range": [-5.0, 3.5]},
     "search": {"setting": "grip", "low": 0.4, "high": 1.2, "resolution": 0.01},
 }  # fmt: skip
 DRY = {"name": "ideal", "friction": 0.9}
