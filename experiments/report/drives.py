@@ -29,8 +29,8 @@ TRACE = (
 """Arrays that a trace must hold to be drawn."""
 LEAD = "lpv-nmpc"
 """Agent whose figures come first, if it has driven."""
-RANDOM = re.compile(r"random-((fast|limit)-)?\d{1,18}")
-"""Names of random paths."""
+MADE = re.compile(r"(random(-fast|-limit)?|circuit)-\d{1,18}|iso-3888-[12]-\d{1,4}(\.\d{1,8})?")
+"""Names of random paths, circuits and lane changes, which no file stands behind."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class NamedFiles:
 
     def closed_path(self, trajectory: str) -> bool:
         """Return whether a trajectory is a file that may not be opened."""
-        named = trajectory in trajectories.names() or RANDOM.fullmatch(trajectory) is not None
+        named = trajectory in trajectories.names() or MADE.fullmatch(trajectory) is not None
         return not named and not self._may_open(trajectory)
 
     def closed_vehicle(self, vehicle: str) -> bool:

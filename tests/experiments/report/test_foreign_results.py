@@ -208,7 +208,9 @@ def test_files_of_the_own_sweep_are_opened_and_no_others() -> None:
     assert named.closed_path("b.csv")
     assert named.closed_path("/dev/random")
     assert named.closed_path("random-1.csv")
-    assert not named.closed_path("random-fast-17")
+    for made in ("random-fast-17", "random-limit-3", "circuit-5", "iso-3888-2-1.61"):
+        assert not named.closed_path(made)
+    assert named.closed_path("iso-3888-3-1.61")
     assert not named.closed_path("T2-raw")
     assert named.closed_vehicle("mine.json")
     assert not named.closed_vehicle("m2-minibus")
