@@ -230,7 +230,18 @@ ValueError
     assert _generator("docstrings").markdown(text) == expected
 
 
-def test_the_headline_table_is_that_of_the_results_page() -> None:
+def cells_of(table: list[str]) -> dict[tuple[str, str], str]:
+    """Return the cells of a Markdown table by row and column."""
+    lines = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in table]
+    heading, _, *rows = lines
+    return {
+        (row[0], name): cell
+        for row in rows
+        for name, cell in zip(heading[1:], row[1:], strict=True)
+    }
+
+
+def test_the_headline_tables_are_those_of_the_results_page() -> None:
     """MLE / ALE of README's table stand in the rows of the results."""
     results = (DOCS / "results.md").read_text()
     simulated = re.findall(r"^\|\s*(T\d)?\s*\|([^|]+)\|(.*)\|$", results, re.MULTILINE)
@@ -242,7 +253,16 @@ def test_the_headline_table_is_that_of_the_results_page() -> None:
         if path and len(cells) == 8:
             found[agent.strip(" *"), path] = f"{cells[2]} / {cells[3]}"
     section = (ROOT / "README.md").read_text().split("## Results")[1].split("\n## ")[0]
-    rows = [line for line in section.splitlines() if line.startswith("|")]
+    rows, limits = (
+        [line for line in part.splitlines() if line.startswith("|")]
+        for part in section.split("The suite `limits` drives where")[:2]
+    )
+    # Each entry of the second table stands in the larger one of the results.
+    assert len(limits) > 8
+    larger = results[results.index("| regime (drives) |") :].splitlines()
+    entries = cells_of(larger[: larger.index("")])
+    for place, entry in cells_of(limits).items():
+        assert entries[place] == entry, place
     compared = 0
     for row in rows:
         if row in results or row.startswith(("| simulation", "| `realtime`", "|---")):

@@ -132,6 +132,7 @@ def test_the_command_goes_on_where_it_was(
         return Found(msgspec.structs.replace(found.limit, case=case), found.motion)
 
     monkeypatch.setattr(compute, "compute", stand_in)
+    monkeypatch.setenv("COLUMNS", "160")
     file = tmp_path / "limits.json"
     command = ["limits", "iso-3888-2-1.61", "iso-3888-2-1.7", "--out", str(file)]
     assert main(command) == 130
