@@ -36,40 +36,27 @@ class LimitCase(msgspec.Struct, frozen=True, order=True):
 
 
 class Limit(msgspec.Struct, frozen=True):
-    """A limit, with what shows that it is one.
-
-    Parameters
-    ----------
-    case
-        Its case.
-    kind
-        "entry speed" (m/s, the highest) or "lap time" (s, the least).
-    value
-        The limit.
-    replayed
-        What the inputs found achieve when they are driven anew by the environment's integrator:
-        distance from the cones, or largest lateral error, m.
-    beyond
-        What is possible `BEYOND` the limit: the largest distance from the cones (negative: they are
-        hit), or the least corridor, m; the best that was found from several starts.
-    starts
-        Number of these starts from which a local optimum was found.
-    nodes, iterations, seconds
-        Size and effort of the solve.
-    path_digest
-        Digest of the path's geometry.
-    """
+    """A limit, with what shows that it is one."""
 
     case: LimitCase
     kind: str
+    """Either "entry speed" (m/s, the highest) or "lap time" (s, the least)."""
     value: float
+    """The limit."""
     replayed: float
+    """What the inputs found achieve when they are driven anew by the environment's integrator:
+    distance from the cones, or largest lateral error, m."""
     beyond: float
+    """What is possible `BEYOND` the limit, the best that was found from several starts: the largest
+    distance from the cones (negative: they are hit), or the least corridor, m."""
     starts: int
+    """Number of these starts from which a local optimum was found."""
     nodes: int
     iterations: int
     seconds: float
+    """Size and effort of the solve."""
     path_digest: str
+    """Digest of the path's geometry."""
 
     @property
     def shown(self) -> bool:
