@@ -137,8 +137,10 @@ _lane_change = lru_cache(maxsize=64)(lane_changes.load)
 
 @lru_cache(maxsize=256)
 def _random(kind: str, seed: int) -> ReferencePath:
-    if kind in {"random-limit", "circuit"}:
-        return limit_path(seed) if kind == "random-limit" else circuit(seed)
+    if kind == "random-limit":
+        return limit_path(seed)
+    if kind == "circuit":
+        return circuit(seed)
     return random_path(seed, fast=kind == "random-fast")
 
 

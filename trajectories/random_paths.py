@@ -82,9 +82,7 @@ def limit_path(seed: int) -> ReferencePath:
     ValueError
         If the seed is no whole number from 0 to 2^128 - 1.
     """
-    seed = SEED.of("seed", seed)
-    rng, grip = np.random.default_rng(seed), GRIPS[seed % len(GRIPS)]
-    limits = _limits(rng, grip)
+    seed, rng, grip, limits = _at_grip(seed)
     wanted = float(rng.uniform(500.0, 900.0))
     segments = _segments(rng, limits, wanted, (12.0, 80.0), (20.0, 200.0))
     return shapes.from_geometry(
@@ -105,9 +103,7 @@ def circuit(seed: int) -> ReferencePath:
     ValueError
         If the seed is no whole number from 0 to 2^128 - 1.
     """
-    seed = SEED.of("seed", seed)
-    rng, grip = np.random.default_rng(seed), GRIPS[seed % len(GRIPS)]
-    limits = _limits(rng, grip)
+    seed, rng, grip, limits = _at_grip(seed)
     geometry = next(found for _ in count() if (found := _closed(rng, limits)) is not None)
     return shapes.from_geometry(
         geometry, limits, f"circuit-{seed}", closed=True,
@@ -115,12 +111,16 @@ def circuit(seed: int) -> ReferencePath:
     )  # fmt: skip
 
 
-def _limits(rng: np.random.Generator, grip: float) -> SpeedLimits:
-    return SpeedLimits(
+def _at_grip(seed: int) -> tuple[int, np.random.Generator, float, SpeedLimits]:
+    """Return the seed, its generator, share of g and speed limits, which are drawn first."""
+    seed = SEED.of("seed", seed)
+    rng, grip = np.random.default_rng(seed), GRIPS[seed % len(GRIPS)]
+    limits = SpeedLimits(
         max_speed=float(rng.uniform(20.0, 30.0)), max_lateral_acceleration=grip * GRAVITY,
         max_acceleration=2.0, max_deceleration=3.0, max_jerk=4.0, end_speed=10.0,
         max_total_acceleration=grip * GRAVITY,
     )  # fmt: skip
+    return seed, rng, grip, limits
 
 
 def _closed(rng: np.random.Generator, limits: SpeedLimits) -> shapes.Geometry | None:

@@ -44,11 +44,11 @@ class Limit(msgspec.Struct, frozen=True):
     value: float
     """The limit."""
     replayed: float
-    """What the inputs found achieve when they are driven anew by the environment's integrator:
-    distance from the cones, or largest lateral error, m."""
+    """Distance from the cones, or largest lateral error, m, of the inputs found when the
+    environment's integrator drives them anew."""
     beyond: float
-    """What is possible `BEYOND` the limit, the best that was found from several starts: the largest
-    distance from the cones (negative: they are hit), or the least corridor, m."""
+    """Largest distance from the cones (negative: they are hit), or least corridor, m, at a speed or
+    lap time that is `BEYOND` better than the limit: the best that was found from several starts."""
     starts: int
     """Number of these starts from which a local optimum was found."""
     nodes: int

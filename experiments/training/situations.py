@@ -18,7 +18,7 @@ FAR = (4.0, 1.2, 6.0)
 
 @dataclass(frozen=True)
 class Situation:
-    """What a part of the environments of a training drives.
+    """Vehicle, conditions and roads of a part of the environments of a training.
 
     Parameters
     ----------
