@@ -11,7 +11,7 @@ A closed path is a periodic problem: its differences go on over the seam.
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from scipy import sparse
 from scipy.optimize import linprog
 
 from trajectories.arguments import Number, array, check_fields, instance_of, numbers
-from trajectories.path import MINIMUM_POINTS, ReferencePath
+from trajectories.path import MINIMUM_POINTS, MINIMUM_SPEED, ReferencePath
 
 Array = NDArray[np.float64]
 
@@ -49,6 +49,41 @@ FACETS = 4
 polygon is 2 % smaller, at zero longitudinal or lateral acceleration it touches the circle."""
 CHATTER_WEIGHT = 2e-3
 """Weight of the L1 penalty on changes of acceleration; without it profiles chatter at the caps."""
+COMFORTABLE_SPEED = 10.0
+"""m/s: top speed of a planned profile unless one is given."""
+ACCELERATION_SHARE, JERK_SHARE = 0.75, 0.2
+"""Shares of a vehicle's longitudinal acceleration and jerk that a comfortable profile uses: 1.5 of
+the paper's 2 m/s^2, and 1 of 5 m/s^3."""
+UNLIMITED = 1e6
+"""m/s^2: an acceleration that limits nothing."""
+
+
+class PlannedVehicle(Protocol):
+    """Limits of a vehicle that profiles are planned for, as in `lpv_track_env.vehicle`."""
+
+    @property
+    def speed_range(self) -> tuple[float, float]:
+        """Lowest and highest speed, m/s."""
+
+    @property
+    def longitudinal_acceleration_range(self) -> tuple[float, float]:
+        """Hardest braking (negative) and accelerating, m/s^2."""
+
+    @property
+    def max_lateral_acceleration(self) -> float:
+        """Comfortable lateral acceleration, m/s^2."""
+
+    @property
+    def max_jerk(self) -> float:
+        """Largest rate of the acceleration, m/s^3."""
+
+    @property
+    def max_steering_rate(self) -> float:
+        """Largest rate of the steering angle, rad/s."""
+
+    @property
+    def wheelbase(self) -> float:
+        """Distance between the axles, m."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +148,41 @@ class SpeedLimits:
                     "speed limits: corners must be those of a convex polygon, in order"
                 )
             object.__setattr__(self, "corners", tuple(corners))
+
+    @classmethod
+    def of(cls, vehicle: PlannedVehicle) -> "SpeedLimits":
+        """Return the limits of a comfortable profile for a vehicle.
+
+        They are its lateral acceleration, steering rate and wheelbase, `ACCELERATION_SHARE` of its
+        acceleration, `JERK_SHARE` of its jerk, and `COMFORTABLE_SPEED` if it drives that fast.
+        """
+        return cls(
+            max_speed=min(COMFORTABLE_SPEED, vehicle.speed_range[1]),
+            max_lateral_acceleration=vehicle.max_lateral_acceleration,
+            max_acceleration=ACCELERATION_SHARE * vehicle.longitudinal_acceleration_range[1],
+            max_jerk=JERK_SHARE * vehicle.max_jerk,
+            max_steering_rate=vehicle.max_steering_rate,
+            wheelbase=vehicle.wheelbase,
+        )
+
+    @classmethod
+    def hardest(cls, vehicle: PlannedVehicle) -> "SpeedLimits":
+        """Return the limits that a vehicle can drive at, for speeds that somebody else planned.
+
+        They are its top speed, its whole range of longitudinal acceleration, and its steering rate;
+        lateral acceleration has no limit, since linear tyres have none.
+        """
+        slowest, fastest = vehicle.longitudinal_acceleration_range
+        return cls(
+            max_speed=vehicle.speed_range[1],
+            max_lateral_acceleration=UNLIMITED,
+            max_acceleration=fastest,
+            max_deceleration=-slowest,
+            max_jerk=vehicle.max_jerk,
+            max_steering_rate=vehicle.max_steering_rate,
+            wheelbase=vehicle.wheelbase,
+            min_speed=MINIMUM_SPEED,
+        )
 
     @property
     def deceleration(self) -> float:
@@ -223,6 +293,35 @@ def _planned(
     if closed:
         planned[-1] = planned[0]
     return planned
+
+
+def keep_speed(
+    speed: Array, curvature: Array, spacing: float, limits: SpeedLimits, *, closed: bool = False
+) -> Array:
+    """Return the highest speeds (n,), m/s, up to given ones that keep to limits, without jerk.
+
+    Given speeds are kept wherever top speed, lateral acceleration, steering rate and both
+    longitudinal accelerations allow them. The result is never below `MINIMUM_SPEED`, which
+    is also what a stop becomes.
+
+    Parameters
+    ----------
+    speed, curvature
+        (n,) m/s and 1/m at nodes `spacing` (m) apart.
+    limits
+        Limits; total acceleration and corners are not used.
+    closed
+        Whether the last node is the first again.
+    """
+    slow = replace(limits, min_speed=MINIMUM_SPEED)
+    caps = np.minimum(speed_caps(curvature, spacing, slow, closed=closed), speed)
+    caps = np.maximum(caps, MINIMUM_SPEED)
+    if closed:
+        caps = np.append(min(caps[0], caps[-1]), caps[1:-1])
+    squared = caps**2
+    passed = _without_jerk(squared, spacing, limits, closed=closed)
+    kept: Array = np.where(passed < squared, np.sqrt(passed), caps)
+    return np.append(kept, kept[0]) if closed else kept
 
 
 def replanned(path: ReferencePath, limits: SpeedLimits, **metadata: Any) -> ReferencePath:

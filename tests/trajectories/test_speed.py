@@ -5,6 +5,7 @@ import math
 import time
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from trajectories import ReferencePath, SpeedLimits, load, plan_speed
 from trajectories import speed as speed_module
 from trajectories.path import SPACING
-from trajectories.speed import replanned, speed_caps
+from trajectories.speed import keep_speed, replanned, speed_caps
 
 LIMITS = SpeedLimits(max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5)
 NAMES = (
@@ -354,3 +355,46 @@ def test_any_curvature_gets_a_profile_that_keeps_its_limits(
     assert acceleration.min() >= -limits.deceleration - 1e-6
     assert np.abs(jerk).max() <= 1.05 * limits.max_jerk
     assert (speed**2 * np.abs(curvature)).max() <= 1.02 * lateral
+
+
+class TestKeepSpeed:
+    """Speeds that somebody else planned, cut where limits do not allow them."""
+
+    LIMITS = SpeedLimits(
+        max_speed=20.0, max_lateral_acceleration=1e6, max_acceleration=2.0, max_deceleration=4.0,
+        max_steering_rate=0.5, wheelbase=2.5,
+    )  # fmt: skip
+
+    def test_keeps_speeds_within_the_limits_bit_for_bit(self) -> None:
+        s = np.linspace(0.0, 100.0, 401)
+        speed = np.sqrt(4.0 + 2.0 * 1.5 * s)
+        kept = keep_speed(speed, np.zeros(401), 0.25, self.LIMITS)
+        assert np.array_equal(kept, speed)
+
+    def test_a_stop_is_braked_for_and_left_by_both_accelerations(self) -> None:
+        s = np.linspace(0.0, 100.0, 401)
+        speed = np.full(401, 10.0)
+        speed[200] = 0.0
+        kept = keep_speed(speed, np.zeros(401), 0.25, self.LIMITS)
+        away = s - 50.0
+        exact = np.sqrt(0.05**2 + np.where(away > 0.0, 4.0 * away, -8.0 * away))
+        assert np.allclose(kept, np.minimum(exact, 10.0), rtol=1e-12)
+
+    def test_a_closed_path_brakes_across_its_seam(self) -> None:
+        speed = np.full(401, 15.0)
+        speed[[0, -1]] = 1.0
+        kept = keep_speed(speed, np.zeros(401), 0.25, self.LIMITS, closed=True)
+        assert kept[0] == kept[-1] == 1.0
+        acceleration = np.diff(kept**2) / 0.5
+        assert acceleration.max() == pytest.approx(2.0)
+        assert acceleration.min() == pytest.approx(-4.0)
+
+    def test_limits_of_a_vehicle(self) -> None:
+        car = SimpleNamespace(
+            speed_range=(0.5, 8.0), longitudinal_acceleration_range=(-6.0, 4.0), wheelbase=0.33,
+            max_lateral_acceleration=5.0, max_jerk=50.0, max_steering_rate=3.2,
+        )  # fmt: skip
+        planned, hardest = SpeedLimits.of(car), SpeedLimits.hardest(car)
+        assert (planned.max_speed, planned.max_acceleration, planned.max_jerk) == (8.0, 3.0, 10.0)
+        assert (planned.max_lateral_acceleration, planned.wheelbase) == (5.0, 0.33)
+        assert (hardest.max_acceleration, hardest.deceleration) == (4.0, 6.0)
