@@ -37,6 +37,7 @@ PLAUSIBLE: Mapping[str, Range] = {
     "acceleration_range": Range(-60.0, 60.0, "m/s^2"),
     "max_jerk": Range(0.01, 1e4, "m/s^3"),
     "longitudinal_acceleration_range": Range(-60.0, 60.0, "m/s^2"),
+    "max_lateral_acceleration": Range(0.01, 60.0, "m/s^2"),
     "speed_range": Range(-110.0, 110.0, "m/s", (("km/h", 1.0 / 3.6),)),
     "max_lateral_velocity_ratio": Range(0.001, 2.0, ""),
     "length": Range(0.05, 30.0, "m", LENGTHS),

@@ -27,6 +27,9 @@ PARAMETER_ORDER = (
 )
 """Order of `VehicleParameters.as_array` and of the last arguments of `bicycle.field`."""
 
+NEWER_FIELDS = ("implausible", "max_lateral_acceleration")
+"""Fields that files leave out at their default, so that digests of older vehicles stay."""
+
 HEIGHT_SHARE = 0.23
 """Height of the centre of gravity by the wheelbase, where it is not given: that of CommonRoad's two
 cars (0.233 and 0.223); its van has 0.303."""
@@ -101,6 +104,9 @@ class VehicleParameters:
         wheelbase.
     implausible
         Takes values outside of `plausibility.PLAUSIBLE` as they are; they suggest other units.
+    max_lateral_acceleration
+        Bound of |ay| in planned speed profiles, m/s^2: a limit of comfort, not of the tyres; by
+        default 2, the largest lateral acceleration of kumar2025lpv's table of trajectories.
 
     Raises
     ------
@@ -129,6 +135,7 @@ class VehicleParameters:
     width: float = 1.8
     centre_of_gravity_height: float = None  # type: ignore[assignment]  # by the wheelbase
     implausible: bool = False
+    max_lateral_acceleration: float = 2.0
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -210,8 +217,9 @@ class VehicleParameters:
     def as_dict(self) -> dict[str, object]:
         """Parameters as plain values for JSON."""
         values = dataclasses.asdict(self)
-        if not self.implausible:  # as in files of before there was this field
-            del values["implausible"]
+        for field in dataclasses.fields(self):  # as in files of before there were these fields
+            if field.name in NEWER_FIELDS and values[field.name] == field.default:
+                del values[field.name]
         return values
 
 

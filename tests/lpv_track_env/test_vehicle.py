@@ -28,7 +28,7 @@ POSITIVE = (
     "mass", "yaw_inertia", "front_axle_distance", "rear_axle_distance",
     "front_cornering_stiffness", "rear_cornering_stiffness", "max_steering_angle",
     "max_steering_rate", "max_jerk", "max_lateral_velocity_ratio", "length", "width",
-    "centre_of_gravity_height",
+    "centre_of_gravity_height", "max_lateral_acceleration",
 )  # fmt: skip
 
 
@@ -170,6 +170,17 @@ def test_height_of_the_centre_of_gravity_is_by_default_a_share_of_the_wheelbase(
         vehicle.load(written(tmp_path, {**values, "front_axle_distance": "far"}))
 
 
+def test_lateral_acceleration_of_plans_is_by_default_the_papers(tmp_path: Path) -> None:
+    """Files leave the default out, so that they and their digests are as before."""
+    values = M2_MINIBUS.as_dict()
+    assert "max_lateral_acceleration" not in values
+    assert vehicle.load(written(tmp_path, values)).max_lateral_acceleration == 2.0
+    sporty = M2_MINIBUS.replace(max_lateral_acceleration=5.0)
+    assert sporty.as_dict() == {**values, "max_lateral_acceleration": 5.0}
+    assert vehicle.load(written(tmp_path, sporty.as_dict())) == sporty
+    assert M2_MINIBUS.replace(max_lateral_acceleration=2) == M2_MINIBUS
+
+
 def test_json_file_takes_its_name_and_defaults(tmp_path: Path) -> None:
     values = {field: getattr(M2_MINIBUS, field) for field in PARAMETER_ORDER[:-1]}
     car = vehicle.load(written(tmp_path, {**values, "rolling_resistance": 0.015}))
@@ -276,6 +287,7 @@ def test_vehicles_that_others_have_sent_are_plausible(name: str) -> None:
         ({"centre_of_gravity_height": 57}, "57 m is implausible.* cm[?] 57 cm = 0.57 m"),
         ({"rolling_resistance": 2}, "%[?] 2 % = 0.02"),
         ({"speed_range": [1, 120]}, "km/h[?] 120 km/h = 33.33 m/s"),
+        ({"max_lateral_acceleration": 200}, "200 m/s.2 is implausible, expected 0.01 to 60"),
         ({"acceleration_range": [-5000, 3500]}, "acceleration_range -5000 m/s.2 is implausible"),
     ],
 )
