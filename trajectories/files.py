@@ -222,8 +222,6 @@ def _check_geometry(path: ReferencePath, table: TextTable) -> None:
     allowed = np.full_like(apart, 0.02)
     allowed[[0, -1]] += h * np.abs(path.curvature[[0, -1]])
     _reject(np.abs(apart) > allowed, 0, "psi_rad disagrees with the direction of x, y", table)
-    jumps = np.abs(np.diff(path.heading)) > np.pi
-    _reject(jumps, 1, "psi_rad jumps by more than half a turn: it must be unwrapped", table)
     circle, waypoint = circle_curvature(path.x, path.y), signed_waypoint_curvature(path.x, path.y)
     apart = np.minimum(np.abs(path.curvature - circle), np.abs(path.curvature - waypoint))
     around = np.lib.stride_tricks.sliding_window_view(np.pad(np.abs(circle), 2, mode="edge"), 5)

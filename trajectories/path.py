@@ -73,7 +73,7 @@ class ReferencePath:
     x, y
         (n,) m.
     heading
-        (n,) rad, counter-clockwise from x, unwrapped.
+        (n,) rad, counter-clockwise from x; jumps by whole turns, as of arctan2, are unwrapped.
     curvature
         (n,) 1/m, signed, positive to the left.
     speed
@@ -90,8 +90,8 @@ class ReferencePath:
     ------
     ValueError
         If there are fewer than 4 points, lengths differ, a value is not finite (its column and
-        index are named), arc length does not start at 0 or is not uniform, the ends of a closed
-        path do not join, or a speed is below 0.05 m/s.
+        index are named), arc length does not start at 0 or is not uniform, the heading points
+        backwards, the ends of a closed path do not join, or a speed is below 0.05 m/s.
     """
 
     arc_length: Array
@@ -137,12 +137,30 @@ class ReferencePath:
                 f"path {shown(self.name)}: arc_length must start at 0 and be uniform "
                 f"(index {int(np.argmax(uneven)) + 1} is not)"
             )
+        self._check_heading()
         self._check_seam()
         if (self.speed < MINIMUM_SPEED).any():
             index = int(np.argmin(self.speed))
             raise ValueError(
                 f"path {shown(self.name)}: speed[{index}] is {self.speed[index]} m/s, "
                 f"at least {MINIMUM_SPEED} is needed"
+            )
+
+    def _check_heading(self) -> None:
+        """Unwrap the heading; reject one that points backwards, such as one in degrees."""
+        if (np.abs(np.diff(self.heading)) > np.pi).any():
+            unwrapped = np.unwrap(self.heading)
+            unwrapped.flags.writeable = False
+            object.__setattr__(self, "heading", unwrapped)
+        x, y = np.diff(self.x), np.diff(self.y)
+        middle = 0.5 * (self.heading[1:] + self.heading[:-1])
+        backwards = x * np.cos(middle) + y * np.sin(middle) < 0.0
+        if backwards.any():
+            index = int(np.argmax(backwards))
+            raise ValueError(
+                f"path {shown(self.name)}: heading[{index}] is {self.heading[index]:.4g} rad, but "
+                f"the path goes on in direction {np.arctan2(y[index], x[index]):.4g} rad: headings "
+                "must be in radians, counter-clockwise from x"
             )
 
     def _check_seam(self) -> None:

@@ -280,6 +280,25 @@ def test_bad_arrays_are_named(change: dict[str, object], message: str) -> None:
         ReferencePath(**{**arrays(), **change})  # type: ignore[arg-type]
 
 
+def test_wrapped_headings_are_unwrapped() -> None:
+    s = np.linspace(0.0, 160.0, 641)
+    psi = s / 25.0
+    wrapped = np.arctan2(np.sin(psi), np.cos(psi))
+    x, y = 25.0 * np.sin(psi), 25.0 * (1.0 - np.cos(psi))
+    path = ReferencePath(s, x, y, wrapped, np.full_like(s, 1 / 25.0), np.full_like(s, 6.0))
+    assert wrapped.min() < -3.0
+    np.testing.assert_allclose(path.heading, psi, atol=1e-12)
+
+
+@pytest.mark.parametrize("unit", [180.0 / np.pi, -1.0])
+def test_headings_that_point_backwards_are_refused(unit: float) -> None:
+    s = np.linspace(0.0, 160.0, 641)
+    psi = s / 25.0
+    x, y = 25.0 * np.sin(psi), 25.0 * (1.0 - np.cos(psi))
+    with pytest.raises(ValueError, match=r"heading\[\d+\] is .* must be in radians"):
+        ReferencePath(s, x, y, unit * psi, np.full_like(s, 1 / 25.0), np.full_like(s, 6.0))
+
+
 def test_closed_path_must_turn_whole_turns() -> None:
     circle = load("circle")
     with pytest.raises(ValueError, match="whole"):
