@@ -13,8 +13,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from trajectories import ReferencePath, SpeedLimits, load, plan_speed
-from trajectories import speed as speed_module
+from trajectories import ReferencePath, SpeedLimits, load, plan_speed, speed_program
 from trajectories.path import SPACING
 from trajectories.speed import keep_speed, replanned, speed_caps
 
@@ -157,13 +156,13 @@ def test_an_oval_has_the_bang_bang_profile() -> None:
 
 def test_a_long_lap_is_planned_at_once_and_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes: list[int] = []
-    solve = speed_module.linprog
+    solve = speed_program.linprog
 
     def counted(cost: Any, **more: Any) -> Any:
         sizes.append(len(cost) // 2)
         return solve(cost, **more)
 
-    monkeypatch.setattr(speed_module, "linprog", counted)
+    monkeypatch.setattr(speed_program, "linprog", counted)
     curvature = np.where(np.arange(24_001) % 4000 < 100, 0.1, 0.001)
     curvature[-1] = curvature[0]
     limits = dataclasses.replace(LIMITS, max_speed=10.5)
