@@ -348,8 +348,79 @@ VW_VANAGON = _commonroad(
     centre_of_gravity_height=0.7478167416,
 )
 
+F1TENTH = VehicleParameters(
+    name="f1tenth",
+    source=(
+        "1:10 car of F1TENTH: default parameters of f1tenth_gym (m, I, lf, lr, h, limits, size); "
+        "Caf = mu C_Sf m g lr/L and Car = mu C_Sr m g lf/L with mu = 1.0489, C_Sf = 4.718/rad and "
+        "C_Sr = 5.4562/rad, as in its single-track model; the jerk, 100 m/s^3, is this project's; "
+        "planned speeds turn with half of mu g"
+    ),
+    mass=3.74,
+    yaw_inertia=0.04712,
+    front_axle_distance=0.15875,
+    rear_axle_distance=0.17145,
+    front_cornering_stiffness=1.0489 * 4.718 * 3.74 * GRAVITY * 0.17145 / 0.3302,
+    rear_cornering_stiffness=1.0489 * 5.4562 * 3.74 * GRAVITY * 0.15875 / 0.3302,
+    rolling_resistance=0.0,
+    max_steering_angle=0.4189,
+    max_steering_rate=3.2,
+    acceleration_range=(-9.51, 9.51),
+    max_jerk=100.0,
+    longitudinal_acceleration_range=(-9.0, 9.0),
+    speed_range=(0.5, 20.0),
+    # At full lock vy / vx is lr tan(0.4189) / L = 0.23, at the limit of grip -0.18.
+    max_lateral_velocity_ratio=0.3,
+    length=0.58,
+    width=0.31,
+    centre_of_gravity_height=0.074,
+    max_lateral_acceleration=5.0,
+)
+
+
+def _kart_tyres(slope: float, load: float) -> float:
+    """Return an axle's cornering stiffness by its load: two tyres of Lot and Dal Bianco's kart.
+
+    Slope over slip of the Magic Formula: p_Ky1 Fz0 sin(p_Ky4 atan(Fz/(p_Ky2 Fz0))) with
+    p_Ky2 = 1.6, p_Ky4 = 2 and Fz0 = 1.6 * 560 N.
+    """
+    nominal = 1.6 * 560.0
+    return 2.0 * slope * nominal * math.sin(2.0 * math.atan(0.5 * load / (1.6 * nominal)))
+
+
+KART = VehicleParameters(
+    name="kart",
+    source=(
+        "racing kart with driver of R. Lot, N. Dal Bianco, 'Lap time optimisation of a racing "
+        "go-kart', Vehicle System Dynamics 54(2), 2016, as in the database of fastest-lap (m, Izz, "
+        "axles, height; Caf, Car: its tyres' slopes, p_Ky1 = 34.1 and 37.6, at static load); "
+        "steering angle and size of AWSIM's kart of 160 kg; steering rate, jerk and "
+        "accelerations are this project's: its rear brake locks at 4.5 m/s^2; planned speeds turn "
+        "with 0.4 of its grip of 1.5 g"
+    ),
+    mass=165.0,
+    yaw_inertia=25.0,
+    front_axle_distance=0.645,
+    rear_axle_distance=0.4,
+    front_cornering_stiffness=_kart_tyres(34.1, 165.0 * GRAVITY * 0.4 / 1.045),
+    rear_cornering_stiffness=_kart_tyres(37.6, 165.0 * GRAVITY * 0.645 / 1.045),
+    rolling_resistance=0.01,
+    max_steering_angle=0.64,
+    max_steering_rate=2.0,
+    acceleration_range=(-4.5, 4.5),
+    max_jerk=20.0,
+    longitudinal_acceleration_range=(-4.0, 3.5),
+    # At full lock vy / vx is lr tan(0.64) / L = 0.285.
+    max_lateral_velocity_ratio=0.35,
+    length=2.0,
+    width=1.45,
+    centre_of_gravity_height=0.25,
+    max_lateral_acceleration=6.0,
+)
+
 VEHICLES: dict[str, VehicleParameters] = {
-    vehicle.name: vehicle for vehicle in (M2_MINIBUS, COURSE_CAR, FORD_ESCORT, BMW_320I, VW_VANAGON)
+    vehicle.name: vehicle
+    for vehicle in (M2_MINIBUS, COURSE_CAR, FORD_ESCORT, BMW_320I, VW_VANAGON, F1TENTH, KART)
 }
 """Vehicle presets by name."""
 

@@ -136,7 +136,10 @@ def test_a_mirrored_path_gives_mirrored_actions(name, trajectory):
 @pytest.mark.parametrize("vehicle", list(VEHICLES))
 def test_a_circle_leaves_no_steady_error(name, vehicle):
     env = environment("circle", vehicle)
-    lateral, speed, _, end = drive(agents.make(name, env), env)
+    # The kart takes up a yaw rate within one control period: Stanley's damping of 0.1 s, times a
+    # yaw rate of 7 1/s by steering angle at 7.7 m/s, would swing from period to period.
+    settings = {"yaw_damping": 0.05} if (name, vehicle) == ("stanley", "kart") else {}
+    lateral, speed, _, end = drive(agents.make(name, env, **settings), env)
     assert end == "finished"
     assert np.abs(lateral[-40:]).max() < 0.02
     assert np.abs(speed[-40:]).max() < 0.01
@@ -255,7 +258,8 @@ def test_pure_pursuit_on_a_circle_steers_its_curvature(curvature, reference_spee
 def test_lqr_stabilises_every_speed(vehicle, period):
     task = DrivingTask.of(environment("straight", vehicle, control_period=period))
     agent = LpvLqr(task)
-    for speed in np.concatenate([np.arange(-5.0, -0.4, 0.2), np.arange(0.5, 30.01, 0.1)]):
+    fastest = task.vehicle.speed_range[1]  # gains beyond it are those of the top speed
+    for speed in np.concatenate([np.arange(-5.0, -0.4, 0.2), np.arange(0.5, fastest, 0.1)]):
         model = lateral_model(float(speed), period, task.vehicle)
         closed = model.A - model.B @ agent.gains(float(speed)).feedback[np.newaxis, :]
         assert np.abs(np.linalg.eigvals(closed)).max() < 1.0
