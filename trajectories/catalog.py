@@ -2,6 +2,8 @@
 
 import math
 import os
+import re
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -12,10 +14,12 @@ from numpy.typing import NDArray
 from trajectories import files, lane_changes, shapes
 from trajectories.arguments import instance_of, shown
 from trajectories.curvature import PathStatistics, signed_waypoint_curvature
+from trajectories.import_options import ImportOptions
 from trajectories.naming import suggestion
 from trajectories.path import SPACING, ReferencePath
 from trajectories.random_paths import GENERATOR, circuit, limit_path, random_path
-from trajectories.speed import SpeedLimits, plan_speed
+from trajectories.speed import plan_speed
+from trajectories.speed_limits import PlannedVehicle, SpeedLimits
 
 Array = NDArray[np.float64]
 
@@ -76,6 +80,8 @@ PUBLISHED: dict[str, Published] = {
 ANALYTIC = (
     "straight", "circle", "figure-eight", "double-lane-change", "sine", "u-turn", "hairpins",
 )  # fmt: skip
+_FILE = re.compile(r"[/\\]|\.[A-Za-z]\w{1,7}$")
+"""Mark of a file's name: a folder or a suffix."""
 RANDOM = ("random", "random-fast", "random-limit", "circuit")
 """Kinds of random paths, named KIND-SEED."""
 SHAPE_LIMITS = SpeedLimits(
@@ -100,21 +106,54 @@ def names() -> list[str]:
     ]  # fmt: skip
 
 
-def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
-    """Load a path by its name or from a file (native, racetrack or x,y CSV, GPS log).
+def load(
+    trajectory: str | Path | ReferencePath,
+    *,
+    vehicle: PlannedVehicle | None = None,
+    closed: bool | None = None,
+    scale: float = 1.0,
+    smoothing: float | None = None,
+    minimum_distance: float | None = None,
+    speeds: str | None = None,
+    speed_unit: str | None = None,
+    columns: Sequence[str] | None = None,
+    part: str | None = None,
+    origin: Sequence[float] | None = None,
+    max_speed: float | None = None,
+    max_lateral_acceleration: float | None = None,
+    max_acceleration: float | None = None,
+    limits: SpeedLimits | None = None,
+    name: str | None = None,
+) -> ReferencePath:
+    """Load a path by its name or from a file of any format that `trajectories.files.read` reads.
 
-    A `ReferencePath` is returned as it is.
+    A `ReferencePath` is returned as it is. The options are those of
+    `trajectories.import_options.ImportOptions`, and belong to files; a path that ships, or one that
+    was made already, has its own speed whatever the vehicle.
 
     Raises
     ------
     ValueError
-        For an unknown name (the message lists the known ones and the nearest), a bad file, or
-        anything else, such as an array.
+        For an unknown name (the message lists the known ones and the nearest), a bad file, an
+        option that means nothing for what is loaded, or anything else, such as an array.
     """
-    if isinstance(trajectory, ReferencePath):
-        return trajectory
-    words = "a name, a file or a ReferencePath"
-    name = str(instance_of("trajectory", trajectory, str | Path, words))
+    options = ImportOptions(
+        vehicle, closed, scale, smoothing, minimum_distance, speeds, speed_unit, columns, part,
+        origin, max_speed, max_lateral_acceleration, max_acceleration, limits, name,
+    )  # fmt: skip
+    words = "a name, a file or a ReferencePath (ReferencePath.from_waypoints makes one of an array)"
+    instance_of("trajectory", trajectory, str | Path | ReferencePath, words)
+    if not isinstance(trajectory, ReferencePath):
+        if (path := _built_in(str(trajectory))) is None:
+            return files.read(_file(trajectory), options)
+        trajectory = path
+    if given := options.given():
+        raise ValueError(f"{given[0]} belongs to files, but {shown(trajectory.name)} is none")
+    return trajectory
+
+
+def _built_in(name: str) -> ReferencePath | None:
+    """Return the path of a name that this project knows, None for any other."""
     if name in PUBLISHED:
         return _drivable(name)
     if name.endswith("-raw") and name[:-4] in PUBLISHED:
@@ -126,8 +165,15 @@ def load(trajectory: str | Path | ReferencePath) -> ReferencePath:
         if len(seed) > SEED_DIGITS:
             raise ValueError(f"trajectory {shown(name)}: a seed has at most {SEED_DIGITS} digits")
         return _random(kind, int(seed))
-    if name.endswith(".csv") or os.path.isfile(name):  # noqa: PTH113  Path's raises for long names
-        return files.read(Path(name))
+    return None
+
+
+def _file(trajectory: str | Path) -> Path:
+    """Return the file that is meant; raise a ValueError for a text that can only be a name."""
+    name = str(trajectory)
+    named = isinstance(trajectory, Path) or _FILE.search(name)
+    if named or os.path.isfile(name):  # noqa: PTH113  Path's raises for long names
+        return Path(name)
     known = suggestion(name, names(), " and others by their SEED or WIDTH")
     raise ValueError(f"unknown trajectory {shown(name)}; {known}, or give a .csv file")
 

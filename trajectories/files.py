@@ -1,14 +1,16 @@
 """Path files: the native CSV format, and one `read` for every format that can be read.
 
 The native format "refpath/1" has leading `# key: JSON` lines (format, name, closed, points, frame,
-the path's metadata, and its statistics as `achieved`), one header line, then a row for each node.
+the path's metadata, and its statistics as `achieved`), one header line, then a row for each node;
+paths of known widths have two columns more.
 Numbers are written so that reading them gives the same bits.
 """
 
 import json
 import re
 import warnings
-from dataclasses import asdict
+from collections.abc import Set
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trajectories.arguments import shortened, shown
+from trajectories.columns import read_points
 from trajectories.curvature import circle_curvature, signed_waypoint_curvature, statistics
-from trajectories.fileio import checked, parse_json, write_atomically
-from trajectories.importers import read_gps, read_racetrack, read_xy
+from trajectories.fileio import checked, parse_json, read_bytes, write_atomically
+from trajectories.formats import HEAD, reader_of
+from trajectories.import_options import USUAL, ImportOptions
+from trajectories.importers import path_of, read_gps, read_racetrack, read_xy
 from trajectories.path import ReferencePath
-from trajectories.speed import SpeedLimits, replanned
-from trajectories.text_table import COLUMNS, TextTable, read_lines, read_table
+from trajectories.speed import replanned
+from trajectories.speed_limits import SpeedLimits
+from trajectories.text_table import MOST_BYTES, TextTable, read_lines
 
 __all__ = ["read", "read_gps", "read_native", "read_racetrack", "read_xy", "write"]
 
@@ -30,11 +36,19 @@ Array = NDArray[np.float64]
 
 FORMAT = "refpath/1"
 HEADER = ("s_m", "x_m", "y_m", "psi_rad", "kappa_1pm", "v_mps", "ax_mps2", "t_s")
+WIDTHS = ("w_right_m", "w_left_m")
+"""Columns that a path of known widths has besides."""
 FRAME = "local: x, y in m, heading counter-clockwise from x"
 RESERVED = ("format", "name", "closed", "points")
 """Keys of the header that metadata cannot replace."""
 LONGEST_NAME = 200
 """Most characters of a path's name in a file."""
+OPTIONS = frozenset(item.name for item in fields(ImportOptions))
+NATIVE_OPTIONS = frozenset(
+    ("vehicle", "name", "speeds", "limits", "max_speed", "max_lateral_acceleration",
+     "max_acceleration")
+)  # fmt: skip
+"""Options that mean something for a native file; those of speed plan it anew."""
 _COMMENT = re.compile(r"#\s*(?P<key>[A-Za-z_][\w-]*)\s*:\s*(?P<value>.*)")
 
 
@@ -75,10 +89,10 @@ def write(path: ReferencePath, file: str | Path) -> None:
         "achieved": asdict(statistics(path)),
     }  # fmt: skip
     lines = [_comment(key, value) for key, value in header.items()]
-    lines.append(",".join(HEADER))
+    lines.append(",".join(HEADER if path.widths is None else HEADER + WIDTHS))
     columns = (
         path.arc_length, path.x, path.y, path.heading, path.curvature, path.speed,
-        path.acceleration, path.time,
+        path.acceleration, path.time, *(() if path.widths is None else path.widths.T),
     )  # fmt: skip
     lines.extend(",".join(map(repr, row)) for row in np.column_stack(columns).tolist())
     try:
@@ -104,26 +118,43 @@ def _plain(value: object) -> object:
     raise TypeError(f"{type(value).__name__} is not a JSON value")
 
 
-def read(file: str | Path) -> ReferencePath:
-    """Read a path of any format: native, racetrack-database, GPS log, or plain x,y.
+def read(file: str | Path, options: ImportOptions = USUAL) -> ReferencePath:
+    """Read a path of any format: native, one of `trajectories.formats`, or a table of points.
 
-    The header decides which. `read` leaves the options of the importers at their defaults.
+    The first bytes and the suffix, the first lines or the header decide which. A table has x,y or
+    latitudes and longitudes, and may have speeds, widths and other columns.
 
     Raises
     ------
     ValueError
-        If the file cannot be read; the message names the file and the line or column.
+        If the file cannot be read; the message names the file and the line or column. Also for an
+        option that means nothing for its format.
     """
-    for line in read_lines(file)[:50]:
-        match = _COMMENT.match(line.strip())
-        if match is not None and match["key"] == "format":
-            return read_native(file)
-    table = read_table(file)
-    if set(COLUMNS["width"]) <= set(table.header):
-        return read_racetrack(file)
-    if table.find("latitude") is not None and table.find("longitude") is not None:
-        return read_gps(file)
-    return read_xy(file)
+    start = read_bytes(file, MOST_BYTES)[:HEAD]
+    if any(_is_format(line) for line in start.split(b"\n")[:50]):
+        _refuse(file, "a native path file", options, NATIVE_OPTIONS)
+        anew = {"limits", "max_speed", "max_lateral_acceleration", "max_acceleration"}
+        planned = options.speeds == "planned" or anew.intersection(options.given())
+        limits = options.planning() if planned else None
+        return read_native(file, limits=limits, name=options.name)
+    if (reader := reader_of(Path(file), start)) is None:
+        raw = read_points(file, options)
+        _refuse(file, f"a table ({raw.kind})", options, OPTIONS - {"part"})
+    else:
+        raw = reader(Path(file), options.part)
+        _refuse(file, f"a {raw.kind}", options, OPTIONS - {"columns", "speed_unit"})
+    return path_of(raw, options)
+
+
+def _is_format(line: bytes) -> bool:
+    match = _COMMENT.match(line.decode("utf-8", "replace").strip().lstrip("\ufeff"))
+    return match is not None and match["key"] == "format"
+
+
+def _refuse(file: str | Path, kind: str, options: ImportOptions, known: Set[str]) -> None:
+    """Refuse options that mean nothing for a kind of file."""
+    if others := [name for name in options.given() if name not in known]:
+        raise ValueError(f"{shortened(file)}: {others[0]} means nothing for {kind}")
 
 
 def read_native(
@@ -147,12 +178,15 @@ def read_native(
         does not increase, or heading or curvature that disagree with the positions.
     """
     metadata, table = _split(Path(file))
-    columns = dict(zip(HEADER, (table.column(k) for k in range(len(HEADER))), strict=True))
+    columns = {name: table.column(k) for k, name in enumerate(table.header)}
+    widths = None
+    if WIDTHS[0] in columns:
+        widths = np.column_stack([columns[name] for name in WIDTHS])
     label, closed = metadata.pop("name", Path(file).stem), metadata.pop("closed", False)
     s, x, y, psi, kappa, v = (columns[key] for key in HEADER[:6])
     try:
         path = ReferencePath(s, x, y, psi, kappa, v, label if name is None else name, closed,
-                             metadata)  # fmt: skip
+                             metadata, widths)  # fmt: skip
     except ValueError as error:
         table.fail(str(error))
     _check_geometry(path, table)
@@ -177,14 +211,16 @@ def _split(file: Path) -> tuple[dict[str, Any], TextTable]:
     header = checked(metadata, Header, file)
     if len(header.name) > LONGEST_NAME or not header.name.isprintable():
         table.fail(f"name {shown(header.name)} is no line of at most {LONGEST_NAME} characters")
-    if first >= len(lines) or lines[first].strip() != ",".join(HEADER):
+    header_line = lines[first].strip() if first < len(lines) else ""
+    if header_line not in {",".join(HEADER), ",".join(HEADER + WIDTHS)}:
         table.fail(f"line {first + 1} is not the header {','.join(HEADER)}")
+    table = replace(table, header=tuple(header_line.split(",")))
     if lines[-1].strip():
         table.fail(f"torn: line {len(lines)} has no end")
     for number, line in enumerate(lines[first + 1 : -1], start=first + 2):
         cells = line.strip().split(",")
-        if len(cells) != len(HEADER):
-            table.fail(f"line {number} has {len(cells)} columns, not {len(HEADER)}")
+        if len(cells) != len(table.header):
+            table.fail(f"line {number} has {len(cells)} columns, not {len(table.header)}")
         table.rows.append(cells)
         table.lines.append(number)
     if metadata.pop("points", len(table.rows)) != len(table.rows):

@@ -1,56 +1,57 @@
-"""Import foreign paths: racing circuits, plain x,y lists, GPS logs.
+"""Make paths of foreign points: racing circuits and lines, waypoints, GPS logs, arrays.
 
 Every import takes the same steps: checks, a smoothing spline whose deviation is reported,
 resampling at 0.25 m of arc length, heading and curvature from the spline's derivatives, and a
-jerk-limited speed profile.
+speed: that of the file as far as the limits allow, or a planned jerk-limited profile.
 """
 
 import math
 import warnings
-from dataclasses import dataclass, field
-from datetime import datetime
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from numpy.typing import ArrayLike, NDArray
 
-from trajectories.arguments import Number, flag, instance_of, numbers, shown
+from trajectories.arguments import array
+from trajectories.columns import read_points
 from trajectories.geodesy import east_north_up
-from trajectories.path import MINIMUM_POINTS, SPACING, ReferencePath
-from trajectories.shapes import Geometry, from_geometry, smooth
-from trajectories.speed import SpeedLimits
-from trajectories.text_table import COLUMNS, TextTable, is_number, read_table
+from trajectories.import_options import IMPORT_LIMITS, NO_LIMITS, USUAL, ImportOptions
+from trajectories.naming import choose
+from trajectories.oddities import oddities
+from trajectories.path import MINIMUM_POINTS, MINIMUM_SPEED, SPACING, ReferencePath
+from trajectories.raw_path import RawPath
+from trajectories.shapes import Smoothed, from_geometry, smooth
+from trajectories.speed import keep_speed
+from trajectories.speed_limits import SpeedLimits
 
 Array = NDArray[np.float64]
 
-IMPORT_LIMITS = SpeedLimits(max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5)
-"""Default speed limits of an imported path: as for analytic shapes, but starting at 1.5 m/s."""
 SMOOTHING = 0.05
 """m rms: removes the jitter of points 5 m apart (on one track the largest curvature falls from
 0.162 to 0.104 1/m)."""
 GPS_SMOOTHING = 0.2
 """m rms."""
-SHARP = 0.115
-"""Curvature from which a bend is warned of, 1/m: a wheelbase of 5 m steers it with 30 degrees."""
-
+GPS_DISTANCES = (1.0, 2.0, 4.0)
+"""m between the points of a GPS log: the first takes out the wandering of a good receiver that
+stands, half a metre rms, most of the time, the others that of worse ones."""
 DUPLICATE = 1e-3
 """m: points closer than this to the one before are merged."""
 GAP_FACTOR = 10.0
 """Multiple of the median distance from which a gap is warned of."""
-APPROACH, APPROACH_ALONG = 2.5, 20.0
-"""m: a path approaches itself if it comes this close to a place this far away along the path."""
-CHUNK = 4096
-"""Points whose neighbours are looked up at once."""
 MINIMUM_LENGTH, MAXIMUM_LENGTH = 1.0, 30_000.0
 """m: other lengths suggest that the coordinates are not metres."""
-SCALES = Number(0.0, 1e9, above=True)
-DISTANCES = Number(0.0, 1e9, "m")
-ORIGIN = Number(-1e6, 1e6)
-"""Rules of arguments."""
 LARGEST_COORDINATE = 1e7
 """m: larger coordinates are not on any map of the Earth."""
+BINDING = {
+    "top speed": ("max_speed",),
+    "lateral acceleration": ("max_lateral_acceleration",),
+    "steering rate": ("max_steering_rate", "wheelbase"),
+    "acceleration or braking": ("max_acceleration", "max_deceleration"),
+}
+"""Limits that lower the speeds of a file."""
 
 
 def read_racetrack(
@@ -64,32 +65,20 @@ def read_racetrack(
 ) -> ReferencePath:
     """Import a centre line in the racetrack-database format, `# x_m,y_m,w_tr_right_m,w_tr_left_m`.
 
-    Parameters
-    ----------
-    file
-        CSV file; the track widths are not used.
-    closed
-        Whether the track is a circuit; None decides by whether the ends meet.
-    scale
-        Factor on all coordinates, to fit a track to a vehicle.
-    limits
-        Speed limits; the default is 10 m/s, 2 m/s^2 laterally, 1.5 m/s^2 longitudinally.
-    smoothing
-        Largest rms deviation of the path from the (scaled) points, m; 0 interpolates.
-    name
-        Name of the path; by default the file's stem.
+    `files.read` reads it too; this needs no header, and refuses other files. The options are those
+    of `ImportOptions`.
 
     Raises
     ------
     ValueError
         If the file cannot be read or is no drivable path; the message names line and column.
     """
-    table = read_table(file)
-    if len(table.rows[0]) != 4 or (table.header and table.find("width") is None):
-        table.fail("is no racetrack-database file: x_m,y_m,w_tr_right_m,w_tr_left_m expected")
-    points = np.column_stack([table.column(0), table.column(1)])
-    importer = _Importer(table, "racetrack-database centre line", limits, smoothing)
-    return importer.path(importer.scaled(points, scale), name, closed)
+    options = ImportOptions(closed=closed, scale=scale, limits=limits, smoothing=smoothing,
+                            name=name, speeds="planned")  # fmt: skip
+    raw = read_points(file, options, ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m"))
+    if not {"x", "width_right"} <= raw.columns.keys():
+        raw.fail("is no racetrack-database file: x_m,y_m,w_tr_right_m,w_tr_left_m expected")
+    return path_of(raw, options)
 
 
 def read_xy(
@@ -101,37 +90,21 @@ def read_xy(
     smoothing: float = SMOOTHING,
     name: str | None = None,
 ) -> ReferencePath:
-    """Import waypoints x,y in metres; files with more columns need a header that names x and y.
+    """Import waypoints x,y in metres, with a planned speed whatever else is in the file.
 
-    Parameters are those of `read_racetrack`. With `closed` None the path counts as closed if its
-    ends are within 1.5 times the spacing (median, first or last) and the direction continues from
-    the end to the start.
+    `files.read` reads them too; this refuses other files. The options are those of `ImportOptions`.
 
     Raises
     ------
     ValueError
         If the file cannot be read, is no drivable path, or seems to be in degrees.
     """
-    table = read_table(file)
-    x, y = table.find("x"), table.find("y")
-    if table.header and (x is None or y is None):
-        if table.find("latitude") is not None:
-            table.fail("has latitudes and longitudes, not metres: read it with read_gps")
-        table.fail(
-            f"no columns x and y in its header {','.join(table.header)[:80]!r}; "
-            f"known: {', '.join(COLUMNS['x'])}"
-        )
-    if not table.header and len(table.rows[0]) != 2:
-        table.fail(f"{len(table.rows[0])} columns without a header: name them, e.g. x_m,y_m")
-    points = np.column_stack([table.column(x or 0), table.column(1 if y is None else y)])
-    small = np.ptp(points, axis=0).max() < 0.5 and np.abs(points).max() <= 180.0
-    if small and scale == 1.0 and len(points) >= MINIMUM_POINTS:
-        table.fail(
-            "all points lie within 0.5 m and look like degrees: name the columns lat,lon to have "
-            "them read as a GPS log, or give a scale if they are lengths"
-        )
-    importer = _Importer(table, "x,y waypoints", limits, smoothing)
-    return importer.path(importer.scaled(points, scale), name, closed)
+    options = ImportOptions(closed=closed, scale=scale, limits=limits, smoothing=smoothing,
+                            name=name, speeds="planned")  # fmt: skip
+    raw = read_points(file, options)
+    if "x" not in raw.columns:
+        raw.fail("has latitudes and longitudes, not metres: read it with read_gps")
+    return path_of(raw, options)
 
 
 def read_gps(
@@ -139,27 +112,16 @@ def read_gps(
     *,
     closed: bool | None = None,
     origin: tuple[float, float, float] | None = None,
-    minimum_distance: float = SPACING,
+    minimum_distance: float | None = None,
     limits: SpeedLimits = IMPORT_LIMITS,
     smoothing: float = GPS_SMOOTHING,
     name: str | None = None,
 ) -> ReferencePath:
-    """Import a GPS log: columns lat, lon, optionally height and time (seconds or ISO 8601).
+    """Import a GPS log, with a planned speed: columns lat, lon, optionally height and time.
 
-    Parameters
-    ----------
-    file
-        CSV file with a header.
-    closed
-        As in `read_xy`.
-    origin
-        Latitude and longitude (deg) and height (m) of x = y = 0; the first point unless given.
-        There x points east and y north. It is stored in `metadata["origin"]`.
-    minimum_distance
-        m: points closer than this to the last kept one are dropped (standstill); their number is
-        in `metadata["dropped"]`.
-    limits, smoothing, name
-        As in `read_racetrack`; logs of consumer receivers may need more `smoothing`.
+    `files.read` reads it too; this refuses other files. The options are those of `ImportOptions`.
+    Times, in seconds or ISO 8601, may not go back. The origin is stored in `metadata["origin"]`,
+    and the number of points that were left out in `metadata["dropped"]`.
 
     Raises
     ------
@@ -167,52 +129,44 @@ def read_gps(
         If the file cannot be read, angles are out of range, time goes back, or the points are no
         drivable path.
     """
-    table = read_table(file)
-    columns = {key: table.find(key) for key in ("latitude", "longitude", "height", "time")}
-    if columns["latitude"] is None or columns["longitude"] is None:
-        table.fail("is no GPS log: a header with lat and lon is needed")
-    angles = {}
-    for key, bound in (("latitude", 90.0), ("longitude", 180.0)):
-        angles[key] = table.column(columns[key] or 0)
-        beyond = np.flatnonzero(np.abs(angles[key]) > bound)
-        if beyond.size:
-            value = angles[key][beyond[0]]
-            table.fail(
-                f"line {table.lines[beyond[0]]}: {key} {value:g} is beyond {bound:g} degrees; "
-                "coordinates in metres need columns x_m,y_m"
-            )
-    zero = np.zeros(len(table.rows))
-    height = zero if columns["height"] is None else table.column(columns["height"])
-    if columns["time"] is not None:
-        back = np.flatnonzero(np.diff(_times(table, columns["time"])) < 0)
-        if back.size:
-            table.fail(f"line {table.lines[back[0] + 1]}: time goes back")
-    if origin is None:
-        origin = (float(angles["latitude"][0]), float(angles["longitude"][0]), float(height[0]))
-    latitude, longitude, above = numbers("origin", origin, ORIGIN, 3)
-    origin = latitude, longitude, above
-    points = east_north_up(angles["latitude"], angles["longitude"], height, origin)[:, :2]
-    importer = _Importer(table, "GPS log", limits, smoothing)
-    kept = importer.thinned(points, DISTANCES.of("minimum_distance", minimum_distance))
-    importer.metadata["origin"] = dict(
-        zip(("latitude_deg", "longitude_deg", "height_m"), origin, strict=True)
-    )
-    importer.metadata["frame"] = "east-north-up at origin (WGS-84): x east, y north, m"
-    importer.metadata["dropped"] = len(points) - len(kept)
-    return importer.path(kept, name, closed)
+    options = ImportOptions(closed=closed, origin=origin, minimum_distance=minimum_distance,
+                            limits=limits, smoothing=smoothing, name=name,
+                            speeds="planned")  # fmt: skip
+    raw = read_points(file, options)
+    if "latitude" not in raw.columns:
+        raw.fail("is no GPS log: a header with lat and lon is needed")
+    return path_of(raw, options)
 
 
-def _times(table: TextTable, index: int) -> Array:
-    """Read times (n,), s, from a column of numbers or of ISO 8601 stamps."""
-    if is_number(table.rows[0][index]):
-        return table.column(index)
-    stamps = np.empty(len(table.rows))
-    for k, row in enumerate(table.rows):
-        try:
-            stamps[k] = datetime.fromisoformat(row[index].strip('"')).timestamp()
-        except (ValueError, OverflowError, OSError):
-            table.fail(f"line {table.lines[k]}: {shown(row[index])} is not a time")
-    return stamps
+def path_of_arrays(
+    points: ArrayLike,
+    speed: ArrayLike | None,
+    widths: ArrayLike | None,
+    options: Mapping[str, Any],
+) -> ReferencePath:
+    """Make a path of arrays, see `ReferencePath.from_waypoints`."""
+    names = tuple(field.name for field in fields(ImportOptions))
+    for key in options:
+        choose("option of from_waypoints", key, names)
+    given = ImportOptions(**options)
+    columns: dict[str, Array] = {}
+    n = len(array("points", points)) if np.ndim(points) else 0
+    for name, value, shape, keys in (
+        ("points", points, (n, 2), ("x", "y")),
+        ("speed", speed, (n,), ("speed",)),
+        ("widths", widths, (n, 2), ("width_right", "width_left")),
+    ):
+        if value is None and name != "points":
+            continue
+        values = array(name, value)
+        if values.shape != shape:
+            raise ValueError(f"{name} must be of shape {shape}, not {values.shape}")
+        if not np.isfinite(values).all():
+            index = int(np.argwhere(~np.isfinite(values))[0][0])
+            raise ValueError(f"{name}[{index}] is {values[index]}: it must be finite")
+        columns |= zip(keys, values.reshape(n, -1).T, strict=True)
+    raw = RawPath("waypoints", "array", "waypoints", columns, [f"point {k}" for k in range(n)])
+    return path_of(raw, given)
 
 
 def imported(path: ReferencePath) -> bool:
@@ -220,82 +174,170 @@ def imported(path: ReferencePath) -> bool:
     return "rms_deviation" in path.metadata
 
 
-@dataclass
-class _Importer:
-    """Make a path from the points of one file: checks, spline, speed profile, warnings."""
+def path_of(raw: RawPath, options: ImportOptions = USUAL) -> ReferencePath:
+    """Make a path of the points of a file or an array.
 
-    table: TextTable
-    kind: str
-    limits: SpeedLimits
-    smoothing: float
-    metadata: dict[str, Any] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    Its metadata tell the source, the deviation of the path from the points, warnings, and in one
+    line, `imported`, what was made of the points and their speeds.
 
-    def __post_init__(self) -> None:
-        instance_of("limits", self.limits, SpeedLimits, "SpeedLimits")
-        self.smoothing = DISTANCES.of("smoothing", self.smoothing)
+    Raises
+    ------
+    ValueError
+        If the points are no drivable path; the message names the file and the point.
+    """
+    return _Import(raw, options).path()
+
+
+class _Import:
+    """Make a path from the points of one file: checks, spline, speed, warnings."""
+
+    def __init__(self, raw: RawPath, options: ImportOptions) -> None:
+        self.options = options
+        self.geographic = "latitude" in raw.columns
+        self.warnings: list[str] = []
+        self.notes: list[str] = []
+        self.metadata = dict(raw.metadata)
+        if not raw.places:
+            raw.fail("has no points")
+        self.raw = self._located(raw)
 
     def warn(self, message: str) -> None:
         """Warn of a flaw that is accepted, and keep the message for the path's metadata."""
         self.warnings.append(message)
-        warnings.warn(f"{self.table.file}: {message}", stacklevel=5)
+        warnings.warn(f"{self.raw.origin}: {message}", stacklevel=6)
 
-    def scaled(self, points: Array, scale: float) -> Array:
-        """Scale points (n, 2), and keep the factor for the metadata."""
-        scale = SCALES.of("scale", scale)
-        if scale != 1.0:
-            self.metadata["scale"] = scale
-        return points * scale
-
-    def thinned(self, points: Array, distance: float) -> Array:
-        """Keep points (m, 2) at least `distance` (m) from the last kept one, and their lines."""
-        kept = [0]
-        for k in range(1, len(points)):
-            if math.dist(points[k], points[kept[-1]]) >= distance:
-                kept.append(k)
-        self.table.lines[:] = [self.table.lines[k] for k in kept]
-        return points[kept]
-
-    def path(self, points: Array, name: str | None, closed: bool | None) -> ReferencePath:
-        """Check points (n, 2), smooth and resample them, and plan a speed profile."""
-        closed = None if closed is None else flag("closed", closed)
-        label = self.table.file.stem if name is None else instance_of("name", name, str, "text")
-        points = self._checked(points)
-        points, closed = self._ends(points, closed)
-        self._check_steps(points, closed)
-        smoothed = smooth(points, self.smoothing, closed=closed)
-        geometry = smoothed.geometry
-        for oddity in oddities(geometry, closed):
+    def path(self) -> ReferencePath:
+        """Check the points, smooth and resample them, and set the speed."""
+        options, before = self.options, self.raw
+        raw, closed = self._thinned()
+        self._check_steps(raw, closed)
+        smoothing = options.smoothing
+        if smoothing is None:
+            smoothing = GPS_SMOOTHING if self.geographic else SMOOTHING
+        smoothed = smooth(_points(raw), smoothing, closed=closed)
+        for oddity in oddities(smoothed.geometry, closed):
             self.warn(oddity)
+        said = (
+            f"{raw.kind} of {len(before.places)} points: {'closed' if closed else 'open'}, "
+            f"{smoothed.geometry.arc_length[-1]:.1f} m, at most {smoothed.max_deviation:.2g} m "
+            "beside them"
+        )
+        self.notes.insert(0, said)
+        speed = self._speed(raw, smoothed, closed)
+        widths = None
+        if "width_right" in raw.columns:
+            sides = [raw.columns[key] * options.scale for key in ("width_right", "width_left")]
+            widths = np.column_stack([_at_nodes(side, smoothed) for side in sides])
+        limits = options.planning()
+        self.metadata |= {
+            "source": f"{raw.kind}: {Path(raw.origin).name}",
+            "smoothing": smoothing,
+            "max_deviation": smoothed.max_deviation,
+            "rms_deviation": smoothed.rms_deviation,
+            "speeds": "planned" if speed is None else "file",
+            "warnings": self.warnings,
+        }
+        label = raw.name if options.name is None else options.name
         try:
-            return from_geometry(
-                geometry, self.limits, label, closed=closed,
-                source=f"{self.kind}: {self.table.file.name}",
-                smoothing=self.smoothing,
-                max_deviation=smoothed.max_deviation,
-                rms_deviation=smoothed.rms_deviation,
-                warnings=self.warnings,
-                **self.metadata,
-            )  # fmt: skip
+            if speed is None:
+                self.notes.append(
+                    f"speed planned for at most {limits.max_speed:.4g} m/s and "
+                    f"{limits.max_lateral_acceleration:.3g} m/s² laterally"
+                )
+                path = from_geometry(
+                    smoothed.geometry, limits, label, closed=closed, **self.metadata
+                )
+            else:
+                path = ReferencePath(
+                    *smoothed.geometry[:5], speed, label, closed,
+                    {"limits": asdict(limits), **self.metadata},
+                )  # fmt: skip
         except RuntimeError as error:  # no speed profile found
-            raise ValueError(f"{self.table.file}: {error}") from error
+            raw.fail(str(error))
+        metadata = {**path.metadata, "imported": "; ".join(self.notes)}
+        return replace(path, metadata=metadata, widths=widths)
 
-    def _checked(self, points: Array) -> Array:
-        """Merge duplicates to points (m, 2); reject too few, or coordinates too large."""
-        far = np.flatnonzero(np.abs(points).max(axis=1) > LARGEST_COORDINATE)
+    def _located(self, raw: RawPath) -> RawPath:
+        """Return the points with scaled columns x and y, m."""
+        columns, options = dict(raw.columns), self.options
+        if self.geographic:
+            columns["x"], columns["y"] = self._projected(raw)
+        elif options.origin is not None:
+            raw.fail("origin belongs to latitudes and longitudes, but it has metres")
+        elif options.scale == 1.0 and len(raw.places) >= MINIMUM_POINTS:
+            points = _points(raw)
+            if np.ptp(points, axis=0).max() < 0.5 and np.abs(points).max() <= 180.0:
+                raw.fail(
+                    "all points lie within 0.5 m and look like degrees: name the columns lat,lon "
+                    "to have them read as a GPS log, or give a scale if they are lengths"
+                )
+        for axis in ("x", "y"):
+            columns[axis] = columns[axis] * options.scale
+        if options.scale != 1.0:
+            self.metadata["scale"] = options.scale
+        located = replace(raw, columns=columns)
+        far = np.flatnonzero(np.abs(_points(located)).max(axis=1, initial=0.0) > LARGEST_COORDINATE)
         if far.size:
-            self.table.fail(f"line {self.table.lines[far[0]]}: coordinate beyond 1e7 m")
-        before, lines = len(points), list(self.table.lines)
-        points = self.thinned(points, DUPLICATE)
-        if len(points) < before:
-            first = min(set(lines).difference(self.table.lines))
-            self.warn(f"{before - len(points)} duplicates under 1 mm merged (first: line {first})")
-        if len(points) < MINIMUM_POINTS:
-            self.table.fail(f"{len(points)} distinct points, at least {MINIMUM_POINTS} are needed")
-        return points
+            raw.fail(f"{raw.places[far[0]]}: coordinate beyond 1e7 m")
+        return located
 
-    def _ends(self, points: Array, closed: bool | None) -> tuple[Array, bool]:
+    def _projected(self, raw: RawPath) -> tuple[Array, Array]:
+        """Return x and y, m, of latitudes and longitudes."""
+        for key, bound in (("latitude", 90.0), ("longitude", 180.0)):
+            beyond = np.flatnonzero(np.abs(raw.columns[key]) > bound)
+            if beyond.size:
+                value = raw.columns[key][beyond[0]]
+                raw.fail(f"{raw.places[beyond[0]]}: {key} {value:g} is beyond {bound:g} degrees")
+        back = np.flatnonzero(np.diff(raw.columns.get("time", np.zeros(1))) < 0.0)
+        if back.size:
+            raw.fail(f"{raw.places[back[0] + 1]}: time goes back")
+        latitude, longitude = raw.columns["latitude"], raw.columns["longitude"]
+        height = raw.columns.get("height", np.zeros(len(latitude)))
+        if (origin := self.options.origin) is None:
+            origin = [float(values[0]) for values in (latitude, longitude, height)]
+        keys = ("latitude_deg", "longitude_deg", "height_m")
+        self.metadata["origin"] = dict(zip(keys, origin, strict=True))
+        self.metadata["frame"] = "east-north-up at origin (WGS-84): x east, y north, m"
+        place = origin[0], origin[1], origin[2]
+        x, y, _ = east_north_up(latitude, longitude, height, place).T
+        return x, y
+
+    def _thinned(self) -> tuple[RawPath, bool]:
+        """Leave out points that are too near to the one before; return whether the rest is closed.
+
+        Of several distances for GPS logs it is the smallest with which the path does not turn back.
+        """
+        raw = self.raw
+        least = self.options.minimum_distance
+        usual = GPS_DISTANCES if self.geographic else (DUPLICATE,)
+        tried = []
+        for distance in usual if least is None else (least,):
+            kept = _kept(raw, distance)
+            tried.append((distance, kept, *self._ends(_of(raw, kept))))
+            if _reversal(_points(tried[-1][2]), tried[-1][3]) is None:
+                break
+        else:
+            tried = tried[:1]
+        distance, kept, thinned, closed = tried[-1]
+        count = len(raw.places) - len(kept)
+        if self.geographic or least is not None:
+            self.metadata["dropped"] = count
+            self.metadata["minimum_distance"] = distance
+        if count and not self.geographic and least is None and "speed" not in raw.columns:
+            first = raw.places[int(np.argmin(np.append(kept, -1) == np.arange(len(kept) + 1)))]
+            self.warn(f"{count} duplicates under 1 mm merged (first: {first})")
+        elif count:
+            self.notes.append(f"{count} points nearer than {distance:g} m or standing left out")
+        if len(thinned.places) < MINIMUM_POINTS:
+            raw.fail(f"{len(thinned.places)} distinct points, at least {MINIMUM_POINTS} are needed")
+        return thinned, closed
+
+    def _ends(self, raw: RawPath) -> tuple[RawPath, bool]:
         """Return the points without a repeated start, and whether the path is closed."""
+        points = _points(raw)
+        closed = raw.closed if self.options.closed is None else self.options.closed
+        if len(points) < MINIMUM_POINTS:
+            return raw, bool(closed)
         gap = points[0] - points[-1]
         repeated = bool(np.hypot(*gap) < DUPLICATE)
         if closed is None:
@@ -306,86 +348,131 @@ class _Importer:
             across = steps[0] if repeated else gap
             closed = bool(near and across @ steps[-1] > 0.0 and across @ steps[0] > 0.0)
         if closed and repeated:
-            points = points[:-1]
-            if len(points) < MINIMUM_POINTS:
-                self.table.fail(f"{len(points)} distinct points, {MINIMUM_POINTS} are needed")
-        return points, closed
+            raw = _of(raw, np.arange(len(points) - 1))
+        return raw, closed
 
-    def _check_steps(self, points: Array, closed: bool) -> None:
+    def _check_steps(self, raw: RawPath, closed: bool) -> None:
         """Reject reversals and impossible lengths; warn of gaps."""
-        steps = np.diff(np.vstack([points, points[:1]]) if closed else points, axis=0)
-        distances = np.hypot(*steps.T)
+        points = _points(raw)
+        distances = np.hypot(*_steps(points, closed).T)
         length = float(distances.sum())
         if not MINIMUM_LENGTH <= length <= MAXIMUM_LENGTH:
-            self.table.fail(
+            raw.fail(
                 f"{length:.4g} m long, not between {MINIMUM_LENGTH:g} and {MAXIMUM_LENGTH:g} m: "
                 "are these metres?"
             )
-        following = np.roll(steps, -1, axis=0) if closed else steps[1:]
-        inner = steps[: len(following)]
-        along = (inner * following).sum(axis=1)
-        across = inner[:, 0] * following[:, 1] - inner[:, 1] * following[:, 0]
-        turns = np.degrees(np.abs(np.arctan2(across, along)))
-        back = np.flatnonzero(turns > 90.0)
-        if back.size:
-            index = int(back[0] + 1) % len(points)
-            self.table.fail(
-                f"the path turns back by {turns[back[0]]:.0f} degrees at point {index} "
-                f"(line {self.table.lines[index]})"
+        if (back := _reversal(points, closed)) is not None:
+            raw.fail(
+                f"the path turns back by {back[1]:.0f} degrees at point {back[0]} "
+                f"({raw.places[back[0]]}); if that is jitter, a minimum_distance takes it out"
             )
         widest = int(np.argmax(distances))
         median = float(np.median(distances))
         if distances[widest] > GAP_FACTOR * median:
             self.warn(
-                f"gap of {distances[widest]:.1f} m after line {self.table.lines[widest]}, "
+                f"gap of {distances[widest]:.1f} m after {raw.places[widest]}, "
                 f"the median is {median:.2f} m"
             )
 
+    def _speed(self, raw: RawPath, smoothed: Smoothed, closed: bool) -> Array | None:
+        """Return the speeds of the file (n,) up to the limits, m/s; None where they are planned."""
+        options = self.options
+        given = raw.columns.get("speed")
+        if options.speeds == "planned":
+            return None
+        if given is None:
+            if options.speeds == "file":
+                raw.fail("has no column of speeds: name one, such as v_mps, or plan the speed")
+            return None
+        column = self.metadata.get("speed_column", "speed")
+        if options.speeds is None and options.scale != 1.0:
+            self.notes.append(f"speeds in {column} not used, since the path is scaled")
+            return None
+        if (given < 0.0).any():
+            index = int(np.argmin(given))
+            raw.fail(
+                f"{raw.places[index]}: speed {given[index]:g} m/s is negative; speeds='planned' "
+                "plans it anew"
+            )
+        if given.max() < MINIMUM_SPEED:
+            self.warn(f"its speeds, in {column}, are all 0: planned instead")
+            return None
+        squared = _at_nodes(given**2, smoothed)
+        s, n = smoothed.geometry.arc_length, len(smoothed.geometry.arc_length)
+        stops = smoothed.places[: len(given)][given < MINIMUM_SPEED]
+        squared[np.rint(stops / s[1]).astype(int).clip(0, n - 1)] = 0.0
+        wanted = np.maximum(np.sqrt(squared), MINIMUM_SPEED)
+        curvature, spacing = smoothed.geometry.curvature, float(s[1])
 
-def oddities(geometry: Geometry, closed: bool) -> list[str]:
-    """Describe what is accepted but unusual: a sharp bend, branches close to each other."""
-    found = []
-    curvature = np.abs(geometry.curvature)
-    sharpest = int(np.argmax(curvature))
-    if curvature[sharpest] > SHARP:
-        found.append(
-            f"bend of {1.0 / curvature[sharpest]:.1f} m radius at "
-            f"{geometry.arc_length[sharpest]:.1f} m: more smoothing may widen it"
+        def kept_to(limits: SpeedLimits) -> Array:
+            return keep_speed(wanted, curvature, spacing, limits, closed=closed)
+
+        limits = options.keeping()
+        speed = kept_to(limits)
+        cut = wanted - speed
+        k = int(np.argmax(cut))
+        said = f"speeds of {column}, {given.min():.3g} to {given.max():.3g} m/s"
+        if cut[k] < 1e-3:
+            self.notes.append(f"{said}, kept")
+            return speed
+        alone = {
+            words: kept_to(replace(NO_LIMITS, **{name: getattr(limits, name) for name in names}))[k]
+            for words, names in BINDING.items()
+        }
+        self.notes.append(
+            f"{said}, lowered on {100.0 * np.mean(cut > 1e-3):.0f} % of the length, at most by "
+            f"{cut[k]:.2f} m/s at {s[k]:.0f} m ({min(alone, key=lambda one: alone[one])})"
         )
-    near = self_approach(geometry, closed)
-    if near is not None:
-        found.append(
-            f"the path comes within {near[2]:.2f} m of itself, at {near[0]:.1f} m and "
-            f"{near[1]:.1f} m: project with the last arc length at hand"
-        )
-    return found
+        return speed
 
 
-def self_approach(geometry: Geometry, closed: bool) -> tuple[float, float, float] | None:
-    """Find where a path comes closest to itself: two arc lengths and their distance, m.
+def _points(raw: RawPath) -> Array:
+    """Return x and y, (n, 2) m."""
+    return np.column_stack([raw.columns["x"], raw.columns["y"]])
 
-    None if no points that lie more than 20 m apart along the path (across the seam too if it is
-    closed) are closer than 2.5 m.
+
+def _of(raw: RawPath, kept: NDArray[np.int_]) -> RawPath:
+    """Keep some points; a speed is the lowest up to the next one that is kept."""
+    columns = {key: values[kept] for key, values in raw.columns.items()}
+    if "speed" in columns:
+        columns["speed"] = np.minimum.reduceat(raw.columns["speed"], kept)
+    return replace(raw, columns=columns, places=[raw.places[k] for k in kept])
+
+
+def _kept(raw: RawPath, distance: float) -> NDArray[np.int_]:
+    """Return the indices of points at least `distance` (m) from the last kept one.
+
+    From points where the vehicle stands that is at least `SPACING`.
     """
-    stride = 2  # 0.5 m: the nearest nodes are at most 0.35 m further apart than the branches
-    s = geometry.arc_length[::stride]
-    points = np.column_stack([geometry.x[::stride], geometry.y[::stride]])
-    # A point's nearest neighbours, itself and those on its own branch included: one more than these
-    # must contain the nearest point of another branch. All pairs may be 10^9 where a path lies over
-    # itself many times.
-    count = 2 * math.ceil(APPROACH_ALONG / s[1]) + 2
-    tree = cKDTree(points, balanced_tree=False)
-    best: tuple[float, float, float] | None = None
-    for first in range(0, len(points), CHUNK):
-        rows = slice(first, first + CHUNK)
-        distances, others = tree.query(points[rows], count, distance_upper_bound=APPROACH)
-        along = np.abs(np.append(s, math.inf)[others] - s[rows, None])
-        if closed:
-            along = np.minimum(along, np.abs(geometry.arc_length[-1] - along))
-        distances[along <= APPROACH_ALONG] = math.inf
-        row, column = np.unravel_index(int(np.argmin(distances)), distances.shape)
-        distance = float(distances[row, column])
-        if distance < (APPROACH if best is None else best[2]):
-            ends = sorted((float(s[first + row]), float(s[others[row, column]])))
-            best = ends[0], ends[1], distance
-    return best
+    points = _points(raw).tolist()
+    least = np.full(len(points), distance)
+    if "speed" in raw.columns:
+        least[raw.columns["speed"] < MINIMUM_SPEED] = max(distance, SPACING)
+    kept = [0]
+    for k, apart in enumerate(least.tolist()[1:], start=1):
+        if math.dist(points[k], points[kept[-1]]) >= apart:
+            kept.append(k)
+    return np.array(kept)
+
+
+def _steps(points: Array, closed: bool) -> Array:
+    return np.diff(np.vstack([points, points[:1]]) if closed else points, axis=0)
+
+
+def _reversal(points: Array, closed: bool) -> tuple[int, float] | None:
+    """Find the first point at which the path turns by more than 90 degrees: index and turn."""
+    steps = _steps(points, closed)
+    following = np.roll(steps, -1, axis=0) if closed else steps[1:]
+    inner = steps[: len(following)]
+    along = (inner * following).sum(axis=1)
+    across = inner[:, 0] * following[:, 1] - inner[:, 1] * following[:, 0]
+    turns = np.degrees(np.abs(np.arctan2(across, along)))
+    back = np.flatnonzero(turns > 90.0)
+    return (int(back[0] + 1) % len(points), float(turns[back[0]])) if back.size else None
+
+
+def _at_nodes(values: Array, smoothed: Smoothed) -> Array:
+    """Interpolate a quantity of the points (m,) to the nodes (n,) of the path."""
+    around = np.resize(values, len(smoothed.places))  # the first again at the end of a closed path
+    nodes: Array = np.interp(smoothed.geometry.arc_length, smoothed.places, around)
+    return nodes

@@ -85,13 +85,16 @@ class ReferencePath:
         turns.
     metadata
         Plain JSON values: source, published and achieved statistics, speed limits, warnings.
+    widths
+        (n, 2) m from the path to the right and the left edge of the road, if known.
 
     Raises
     ------
     ValueError
         If there are fewer than 4 points, lengths differ, a value is not finite (its column and
         index are named), arc length does not start at 0 or is not uniform, the heading points
-        backwards, the ends of a closed path do not join, or a speed is below 0.05 m/s.
+        backwards, the ends of a closed path do not join, a speed is below 0.05 m/s, or a width is
+        negative.
     """
 
     arc_length: Array
@@ -103,25 +106,30 @@ class ReferencePath:
     name: str = "path"
     closed: bool = False
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    widths: Array | None = None
 
     def __post_init__(self) -> None:
-        columns = ("arc_length", "x", "y", "heading", "curvature", "speed")
         instance_of("name", self.name, str, "text")
         instance_of("metadata", self.metadata, Mapping, "a mapping")
         object.__setattr__(self, "closed", flag("closed", self.closed))
         n = np.size(self.arc_length)
+        shape: dict[str, tuple[int, ...]] = dict.fromkeys(
+            ("arc_length", "x", "y", "heading", "curvature", "speed"), (n,)
+        )
+        if self.widths is not None:
+            shape["widths"] = (n, 2)
         if n < MINIMUM_POINTS:
             raise ValueError(
                 f"path {shown(self.name)}: {n} points, at least {MINIMUM_POINTS} are needed"
             )
-        for column in columns:
+        for column, wanted in shape.items():
             values = array(column, getattr(self, column)).copy()
-            if values.shape != (n,):
+            if values.shape != wanted:
                 raise ValueError(
-                    f"path {shown(self.name)}: {column} has shape {values.shape}, not ({n},)"
+                    f"path {shown(self.name)}: {column} has shape {values.shape}, not {wanted}"
                 )
             if not np.isfinite(values).all():
-                index = int(np.flatnonzero(~np.isfinite(values))[0])
+                index = int(np.argwhere(~np.isfinite(values))[0][0])
                 raise ValueError(f"path {shown(self.name)}: {column}[{index}] is {values[index]}")
             values.flags.writeable = False
             object.__setattr__(self, column, values)
@@ -145,6 +153,9 @@ class ReferencePath:
                 f"path {shown(self.name)}: speed[{index}] is {self.speed[index]} m/s, "
                 f"at least {MINIMUM_SPEED} is needed"
             )
+        if self.widths is not None and (self.widths < 0.0).any():
+            index = int(np.argwhere(self.widths < 0.0)[0][0])
+            raise ValueError(f"path {shown(self.name)}: widths[{index}] is negative")
 
     def _check_heading(self) -> None:
         """Unwrap the heading; reject one that points backwards, such as one in degrees."""
@@ -176,6 +187,42 @@ class ReferencePath:
                 f"path {shown(self.name)}: closed, but it turns by {turns:.4f} turns, "
                 "not whole ones"
             )
+
+    @classmethod
+    def from_waypoints(
+        cls,
+        points: ArrayLike,
+        *,
+        closed: bool | None = None,
+        speed: ArrayLike | None = None,
+        widths: ArrayLike | None = None,
+        **options: Any,
+    ) -> "ReferencePath":
+        """Make a path of waypoints in the order of driving, as from a file of them.
+
+        Parameters
+        ----------
+        points
+            (n, 2) x, y in m.
+        closed
+            Whether the end goes on to the start; None decides by whether the ends meet.
+        speed
+            (n,) m/s, which the path keeps up to the limits in the options; planned if None.
+        widths
+            (n, 2) m from the points to the right and the left edge of the road.
+        options
+            Further fields of `trajectories.import_options.ImportOptions`, such as `vehicle`,
+            `smoothing`, `max_speed` or `name`.
+
+        Raises
+        ------
+        ValueError
+            If an array has another shape, a value is not finite, an option is none, or the points
+            are no drivable path; the message names the point.
+        """
+        from trajectories.importers import path_of_arrays
+
+        return path_of_arrays(points, speed, widths, {"closed": closed, **options})
 
     @property
     def length(self) -> float:
@@ -270,6 +317,7 @@ class ReferencePath:
         return replace(
             self, y=-self.y, heading=-self.heading, curvature=-self.curvature,
             name=f"{self.name}-mirrored",
+            widths=None if self.widths is None else self.widths[:, ::-1],
         )  # fmt: skip
 
     def section(self, start: float, end: float) -> "ReferencePath":
@@ -292,6 +340,7 @@ class ReferencePath:
             self.x[nodes], self.y[nodes], self.heading[nodes], self.curvature[nodes],
             self.speed[nodes], f"{self.name}-{start:g}-{end:g}",
             metadata={**self.metadata, "section": [start, end]},
+            widths=None if self.widths is None else self.widths[nodes],
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:

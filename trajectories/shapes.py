@@ -290,11 +290,15 @@ def polyline(kinks: Sequence[float], lengths: ArrayLike) -> tuple[Array, Array]:
 
 
 class Smoothed(NamedTuple):
-    """A curve's geometry, and its distances from the points that it was fitted to, m."""
+    """A curve's geometry, and its distances from the points that it was fitted to, m.
+
+    `places` are the arc lengths of the points, (n,) m; the first is again the last if closed.
+    """
 
     geometry: Geometry
     max_deviation: float
     rms_deviation: float
+    places: Array
 
 
 def smooth(points: Array, tolerance: float, *, closed: bool = False) -> Smoothed:
@@ -319,7 +323,19 @@ def smooth(points: Array, tolerance: float, *, closed: bool = False) -> Smoothed
         spline = make_interp_spline(at, chain, k=3, bc_type="periodic" if closed else None)
     deviation = np.hypot(*(spline(at) - chain).T)
     geometry = parametric(_curve(spline), float(at[-1]))
-    return Smoothed(geometry, float(deviation.max()), float(np.sqrt(np.mean(deviation**2))))
+    return Smoothed(
+        geometry, float(deviation.max()), float(np.sqrt(np.mean(deviation**2))),
+        _arc_lengths(spline, at, geometry.arc_length),
+    )  # fmt: skip
+
+
+def _arc_lengths(spline: "BSpline", at: Array, s: Array) -> Array:
+    """Return the arc lengths (n,) at parameters (n,) of a curve whose nodes have arc lengths s."""
+    t = np.linspace(0.0, at[-1], 4 * len(s))
+    speed = np.hypot(*spline.derivative()(t).T)
+    lengths = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))])
+    places: Array = np.interp(at, t, lengths * (s[-1] / lengths[-1]))
+    return places
 
 
 def _curve(spline: "BSpline") -> Callable[[Array], Derivatives]:

@@ -1,7 +1,7 @@
 """Limits of a speed profile, as they are given or as a vehicle has them."""
 
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -20,6 +20,7 @@ UNLIMITED = 1e6
 """m/s^2: an acceleration that limits nothing."""
 
 
+@runtime_checkable
 class PlannedVehicle(Protocol):
     """Limits of a vehicle that profiles are planned for, as in `lpv_track_env.vehicle`."""
 

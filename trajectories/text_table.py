@@ -1,6 +1,8 @@
 """Read text files of points: cells, header and line numbers."""
 
+import csv
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -16,17 +18,11 @@ Array = NDArray[np.float64]
 MOST_BYTES = 32 * 2**20
 """Largest file that is read, bytes: three hours of a GPS log at 50 Hz."""
 MOST_ROWS, MOST_COLUMNS = 1_000_000, 1000
+LONGEST_QUOTED = 100_000
+"""Characters of a line whose quoted cells may hold separators."""
 
-COLUMNS = {
-    "x": ("x", "x_m", "east", "east_m", "easting", "easting_m"),
-    "y": ("y", "y_m", "north", "north_m", "northing", "northing_m"),
-    "latitude": ("lat", "latitude", "lat_deg", "latitude_deg"),
-    "longitude": ("lon", "lng", "long", "longitude", "lon_deg", "longitude_deg"),
-    "height": ("h", "h_m", "height", "height_m", "alt", "alt_m", "altitude", "altitude_m", "ele"),
-    "time": ("t", "t_s", "time", "time_s", "timestamp"),
-    "width": ("w_tr_right_m", "w_tr_left_m"),
-}
-"""Names that a column of each quantity may have in a header, in lower case."""
+SEPARATORS = (";", ",", "\t", None)
+"""Separators of cells, None being blanks: of equals the first is taken."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +33,7 @@ class TextTable:
     header: tuple[str, ...]
     rows: list[list[str]]
     lines: list[int]
+    separator: str | None = ","
 
     def fail(self, message: str) -> NoReturn:
         """Raise a ValueError that begins with the file's name."""
@@ -51,20 +48,13 @@ class TextTable:
         if len(self.header or self.rows[0]) > MOST_COLUMNS:
             self.fail(f"more than {MOST_COLUMNS} columns are not read")
 
-    def find(self, quantity: str) -> int | None:
-        """Return the index of a quantity's column, one of `COLUMNS`; None if there is none."""
-        for name in COLUMNS[quantity]:
-            if name in self.header:
-                return self.header.index(name)
-        return None
-
     def column(self, index: int) -> Array:
         """Return the numbers of a column, (n,); a cell that is not a finite number is an error."""
         name = shortened(self.header[index], 40) if self.header else str(index + 1)
         values = np.empty(len(self.rows))
         for k, (row, line) in enumerate(zip(self.rows, self.lines, strict=True)):
             try:
-                values[k] = float(row[index])
+                values[k] = _number(row[index], self.separator)
             except ValueError:
                 self.fail(f"line {line}, column {name}: {shown(row[index])} is not a number")
             if not math.isfinite(values[k]):
@@ -77,8 +67,12 @@ def read_lines(file: str | Path) -> list[str]:
     return read_text(file, MOST_BYTES).split("\n")
 
 
-def read_table(file: str | Path) -> TextTable:
-    """Split a text file at `,` or `;`; its header may be a `#` comment or a line without numbers.
+def read_table(file: str | Path, known: Callable[[str], object]) -> TextTable:
+    """Split a text file at `;`, `,`, tabs or blanks; commas are decimal ones unless they separate.
+
+    A header is a line before the first row with a number, a comment (`#`, `%`) or not, of as many
+    cells as the rows: the last one of which two names, in lower case, are `known`, or else the last
+    one that is no comment.
 
     Raises
     ------
@@ -86,43 +80,82 @@ def read_table(file: str | Path) -> TextTable:
         For a file that cannot be read, has no rows or too many, or if rows differ in their number
         of cells.
     """
-    comments: list[tuple[str, ...]] = []
-    header: tuple[str, ...] = ()
+    heads: list[str] = []
     rows: list[list[str]] = []
     lines: list[int] = []
+    separator: str | None = None
     for number, line in enumerate(read_lines(file), start=1):
         text = line.strip()
-        if not text:
+        if not text or text[0] in "#%":
+            if text and not rows:
+                heads.append(text)
             continue
-        parts = text.lstrip("#").split(";" if ";" in text else ",", MOST_COLUMNS)
-        cells = [cell.strip() for cell in parts]
-        if text.startswith("#"):
-            if not rows:
-                comments.append(tuple(cell.strip('" ').lower() for cell in cells))
-        elif not rows and not header and not any(map(is_number, cells)):
-            header = tuple(cell.strip('" ').lower() for cell in cells)
-        else:
-            rows.append(cells)
-            lines.append(number)
-            if len(rows) > MOST_ROWS:
-                break
-    table = TextTable(Path(file), header, rows, lines)
+        if not rows:
+            separator = _separator(text)
+        cells = _split(text, separator)
+        if not rows and not any(is_number(cell, separator) for cell in cells):
+            heads.append(text)
+            continue
+        rows.append(cells)
+        lines.append(number)
+        if len(rows) > MOST_ROWS:
+            break
+    table = TextTable(Path(file), (), rows, lines, separator)
     table.check_size()
+    header = _header(heads, len(rows[0]), separator, known)
     width = len(header or rows[0])
     for row, number in zip(rows, lines, strict=True):
         if len(row) != width:
             table.fail(f"line {number} has {len(row)} columns, not {width}: torn or not a table")
-    if not header:
-        known = {name for group in COLUMNS.values() for name in group}
-        fitting = [c for c in comments if len(c) == width and len(known.intersection(c)) >= 2]
-        table = TextTable(table.file, fitting[-1] if fitting else (), rows, lines)
-    return table
+    return TextTable(table.file, header, rows, lines, separator)
 
 
-def is_number(text: str) -> bool:
+def _header(
+    heads: Sequence[str], width: int, separator: str | None, known: Callable[[str], object]
+) -> tuple[str, ...]:
+    """Return the names in the lines before the first row, (width,) or () if none are there."""
+    header: tuple[str, ...] = ()
+    for text in reversed(heads):
+        for sign in (separator, *SEPARATORS):
+            names = tuple(cell.lower() for cell in _split(text.lstrip("#% \t"), sign))
+            if len(names) == width:
+                if sum(known(name) is not None for name in names) >= 2:
+                    return names
+                if not header and text[0] not in "#%":
+                    header = names
+                break
+    return header
+
+
+def _separator(text: str) -> str | None:
+    """Return the separator that makes numbers of most of a row's cells."""
+
+    def share(separator: str | None) -> float:
+        cells = _split(text, separator)
+        found = sum(is_number(cell, separator) for cell in cells)
+        return found / len(cells) if len(cells) > 1 else 0.0
+
+    return max(SEPARATORS, key=share)
+
+
+def _split(text: str, separator: str | None) -> list[str]:
+    """Split a line into cells without quotes; of too many, a few more than are read."""
+    if separator is not None and '"' in text and len(text) < LONGEST_QUOTED:
+        cells = next(csv.reader([text.replace("\r", " ")], delimiter=separator))
+    else:
+        cells = text.split(separator, MOST_COLUMNS)
+    return [cell.strip('" ') for cell in cells]
+
+
+def _number(text: str, separator: str | None) -> float:
+    """Read a number, with a decimal comma where commas do not separate cells."""
+    return float(text if separator == "," else text.replace(",", ".", 1))
+
+
+def is_number(text: str, separator: str | None = ",") -> bool:
     """Return whether a cell can be read as a number; NaN and infinity count as numbers."""
     try:
-        float(text)
+        _number(text, separator)
     except ValueError:
         return False
     return True

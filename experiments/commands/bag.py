@@ -252,7 +252,7 @@ def _reference(options: argparse.Namespace, console: Console) -> int:
     """Write the reference path of a recorded drive and return 0."""
     from experiments.ros.reference import reference
     from trajectories.files import write
-    from trajectories.importers import IMPORT_LIMITS
+    from trajectories.import_options import IMPORT_LIMITS
 
     if options.out.suffix != ".csv":
         raise ValueError(f"{options.out}: a path is written as NAME.csv")

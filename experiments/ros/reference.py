@@ -17,7 +17,7 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 
 from experiments.ros.read import BagError, Reading, info, read
 from experiments.ros.topics import Datum, Fixes, GeoPoint, Odometry
-from trajectories.importers import oddities
+from trajectories.oddities import oddities
 from trajectories.path import ReferencePath
 from trajectories.shapes import Geometry, from_geometry, largest_penalty, smooth
 from trajectories.speed import SpeedLimits
