@@ -35,8 +35,7 @@ NAMES: dict[str, tuple[dict[str, float], str]] = {
     "time": (TIMES, "t time timestamp"),
     "speed": (
         SPEED_UNITS,
-        "v vx velocity speed vel vx_racetraj longitudinal_velocity target_speed ground_speed "
-        "gps_speed linear_x",
+        "v vx velocity speed vel vx_racetraj longitudinal_velocity target_speed gps_speed linear_x",
     ),
     "sideways": (SPEED_UNITS, "vy"),
     "width_right": (LENGTHS, "w_tr_right width_right w_right"),

@@ -22,9 +22,10 @@ from trajectories import (
     text_table,
 )
 from trajectories.files import read, write
-from trajectories.importers import IMPORT_LIMITS, self_approach
+from trajectories.import_options import IMPORT_LIMITS, USUAL
+from trajectories.oddities import APPROACH, APPROACH_ALONG, self_approach
+from trajectories.raw_path import RawPath
 from trajectories.shapes import Geometry
-from trajectories.text_table import TextTable
 
 
 def refusal(call: Any, *arguments: Any, **named: Any) -> str:
@@ -53,7 +54,7 @@ def test_a_spiral_that_lies_over_itself_takes_little_time_and_memory() -> None:
     tracemalloc.stop()
     assert found is not None
     assert found[2] == pytest.approx(0.002, rel=1e-3)
-    assert found[1] - found[0] > importers.APPROACH_ALONG
+    assert found[1] - found[0] > APPROACH_ALONG
     assert peak < 200e6
     assert took < 60.0  # about a second on an idle machine
 
@@ -73,10 +74,10 @@ def test_the_closest_approach_is_that_of_all_pairs(closed: bool) -> None:
         along = np.abs(at[:, None] - at[None])
         if closed:
             along = np.minimum(along, s[-1] - along)
-        distances[along <= importers.APPROACH_ALONG] = math.inf
+        distances[along <= APPROACH_ALONG] = math.inf
         answers.append(found)
         if found is None:
-            assert distances.min() >= importers.APPROACH
+            assert distances.min() >= APPROACH
         else:
             assert found[2] == pytest.approx(distances.min(), rel=1e-12)
             i, j = np.searchsorted(at, found[0]), np.searchsorted(at, found[1])
@@ -87,12 +88,11 @@ def test_the_closest_approach_is_that_of_all_pairs(closed: bool) -> None:
 
 def test_a_duplicate_in_the_last_of_many_rows_is_named_at_once() -> None:
     n = 300_000
-    points = np.column_stack([0.1 * np.append(np.arange(n), n - 1), np.zeros(n + 1)])
-    table = TextTable(Path("long.csv"), (), [], list(range(1, n + 2)))
-    importer = importers._Importer(table, "x,y", IMPORT_LIMITS, 0.05)
+    columns = {"x": 0.1 * np.append(np.arange(n), n - 1), "y": np.zeros(n + 1)}
+    raw = RawPath("x,y", "long.csv", "long", columns, [f"line {k}" for k in range(1, n + 2)])
     began = time.perf_counter()
     with pytest.warns(UserWarning, match=rf"1 duplicates .*first: line {n + 1}\b"):
-        assert len(importer._checked(points)) == n
+        assert len(importers._Import(raw, USUAL)._thinned()[0].places) == n
     assert time.perf_counter() - began < 20.0  # it took hours when it was quadratic
 
 
@@ -148,7 +148,7 @@ def test_names_of_any_length_are_refused_in_a_short_line(name: str) -> None:
 
 def test_an_array_is_no_trajectory() -> None:
     for given in (np.zeros((9, 2)), [[0, 1]], None, 3):
-        assert "a ReferencePath, not" in refusal(trajectories.load, given)
+        assert "ReferencePath.from_waypoints makes one" in refusal(trajectories.load, given)
 
 
 @pytest.fixture
@@ -223,7 +223,7 @@ def points(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_arguments_of_importers_are_refused_in_a_short_line(
     key: str, wrong: Any, points: Path
 ) -> None:
-    if wrong is None and key in {"closed", "origin"}:
+    if wrong is None:
         assert importers.read_gps(points).length > 20.0
     else:
         assert key in refusal(importers.read_gps, points, **{key: wrong})

@@ -358,7 +358,7 @@ def bad(index: int, column: int, value: float) -> np.ndarray:
     ("points", "header", "message"),
     [
         (bad(4, 1, math.nan), "x,y", "line 6, column y: 'nan' is not finite"),
-        (bad(4, 0, math.inf), "", "line 5, column 1: 'inf' is not finite"),
+        (bad(4, 0, math.inf), "", "line 5, column x_m: 'inf' is not finite"),
         (bad(4, 0, 2e7), "", "line 5: coordinate beyond"),
         (sine()[:3], "", "3 distinct points, at least 4"),
         (np.repeat(sine()[:3], 3, axis=0), "", "3 distinct points, at least 4"),
@@ -369,7 +369,7 @@ def bad(index: int, column: int, value: float) -> np.ndarray:
         ([[48.1 + 1e-4 * k, 11.5] for k in range(9)], "", "look like degrees: name the columns"),
         ([[1, 2, 3]] * 5, "", "3 columns without a header"),
         (sine(), "a,b", "no columns x and y in its header"),
-        (sine(), "lat,y", "latitudes and longitudes, not metres"),
+        (sine(), "lat,y", "a GPS log needs latitudes and longitudes"),
         ([[5e5, 5.3e6 + k] for k in range(9)], "lat,lon", "latitude 500000 is beyond 90"),
         ([[48.0, 400.0 + k] for k in range(9)], "lat,lon", "longitude 400 is beyond 180"),
     ],

@@ -21,7 +21,7 @@ from tests.helpers.recorded_drives import driven
 from trajectories import ReferencePath
 from trajectories.files import write as write_path
 from trajectories.geodesy import geodetic
-from trajectories.importers import IMPORT_LIMITS
+from trajectories.import_options import IMPORT_LIMITS
 
 pytest.importorskip("rosbags", reason="rosbags is not installed")
 
