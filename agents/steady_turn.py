@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agents.reference import LocalReference
+from lpv_track_env.steady_turn import steady_turn as solved
 from lpv_track_env.vehicle import VehicleParameters
 
 
@@ -25,16 +26,7 @@ class Turn(NamedTuple):
 def steady_turn(curvature: float, speed: float, vehicle: VehicleParameters) -> Turn:
     """Compute steering, sideslip and yaw rate on a circle of the centre of gravity.
 
-    The solution is exact for the bicycle.
-
-    With vy' = r' = 0 (`lpv_track_env.bicycle`) the axles share the lateral force m r vx by lr/L and
-    lf/L, so that vy = b r with b = lr - m vx^2 lf/(L Car), and the curvature r/sqrt(vx^2 + vy^2)
-    gives the yaw rate per speed rho = kappa/sqrt(1 - (kappa b)^2). Then::
-
-        delta = rho (b + lf) + rho m vx^2 lr/(L Caf cos(delta))
-
-    which for small angles is L kappa + K vx^2 kappa with the understeer gradient K (Rajamani,
-    Vehicle Dynamics and Control, section 3.3). Nothing is divided by the speed.
+    The solution is exact for the bicycle on linear tyres (`lpv_track_env.steady_turn`).
 
     Parameters
     ----------
@@ -45,19 +37,12 @@ def steady_turn(curvature: float, speed: float, vehicle: VehicleParameters) -> T
     vehicle
         The vehicle.
     """
-    lf, lr, wheelbase = vehicle.front_axle_distance, vehicle.rear_axle_distance, vehicle.wheelbase
-    caf, car = vehicle.front_cornering_stiffness, vehicle.rear_cornering_stiffness
-    limit = vehicle.max_steering_angle / wheelbase
-    curvature = min(max(curvature, -limit), limit)
-    momentum = vehicle.mass * speed * speed / wheelbase
-    lever = lr - momentum * lf / car
-    # Limit the sideslip to 60 degrees.
-    ratio = min((curvature * lever) ** 2, 0.75)
-    turning = curvature / math.sqrt(1.0 - ratio)
-    delta = turning * wheelbase
-    for _ in range(3):  # a fixed-point iteration that contracts by delta^2 or better
-        cosine = math.cos(min(max(delta, -0.8), 0.8))
-        delta = turning * (lever + lf + momentum * lr / (caf * cosine))
+    lr = vehicle.rear_axle_distance
+    delta, turning, lever = solved(
+        curvature, speed, vehicle.mass, vehicle.front_axle_distance, lr,
+        vehicle.front_cornering_stiffness, vehicle.rear_cornering_stiffness,
+        vehicle.max_steering_angle,
+    )  # fmt: skip
     return Turn(
         delta, math.atan(turning * lever), turning * speed, math.atan(turning * (lever - lr))
     )

@@ -87,11 +87,11 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ## Starting state
 
-    On the path at its start, at the reference speed, steering straight. `initial_error_range` gives
-    uniformly drawn errors in lateral offset (m), heading (rad) and speed (m/s); `random_start`
-    draws the arc length, too. `reset(seed=...)` seeds `self.np_random` and takes one key from it;
-    an episode depends on this key and its number (`lpv_track_env.episodes`). Environment i of a
-    `PathTrackingVectorEnv` reset with seed s therefore equals this one reset with s + i.
+    On the path at its start, at the reference speed, in the steady turn of its curvature.
+    `initial_error_range` gives drawn errors in lateral offset (m), heading (rad) and speed (m/s);
+    `random_start` draws the arc length, too. `reset(seed=...)` seeds `self.np_random` and takes one
+    key from it; an episode depends on this key and its number (`lpv_track_env.episodes`), so
+    environment i of a `PathTrackingVectorEnv` reset with seed s equals this one reset with s + i.
 
     `reset(options=...)` takes `trajectory`, `vehicle` (both as in the arguments), `arc_length` (m),
     `lateral_error` (m), `heading_error` (rad), and `speed_error` or `speed` (m/s), for one episode.
@@ -345,21 +345,21 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         super().reset(seed=seed)
         self._count_episode(reseeded=seed is not None)
         self._use(task, plant)
+        own = plants.friction_range(plant, None)[0]
         if self._conditioned is None:
             episodes.begin(
                 self._record, self._constants, self._table, self._observation,
-                self._key, self._episode, given,
+                self._key, self._episode, given, own,
             )  # fmt: skip
         else:
             self._draws[:] = self._key, self._episode
             conditions_episode.begin_under_conditions(
                 self._conditioned.vehicle, self._record, self._conditioned.spec, self._constants,
-                self._table, self._observation, self._draws, given,
+                self._table, self._observation, self._draws, given, own,
             )  # fmt: skip
-        if plant is not None and self._conditioned is not None:
-            plant.begin(self._record, float(self._conditioned.vehicle[FRICTION]))
-        elif plant is not None:
-            plant.begin(self._record)
+        if plant is not None:
+            drawn = math.inf if self._conditioned is None else self._conditioned.vehicle[FRICTION]
+            plant.begin(self._record, float(drawn))
         self._running = True
         self._begin_drawing()
         if self.render_mode == "human":

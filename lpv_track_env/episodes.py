@@ -14,8 +14,9 @@ from lpv_track_env import kernels
 from lpv_track_env.bicycle import PSI, VX, X, Y
 from lpv_track_env.draws import uniform
 from lpv_track_env.reward import TERMS
+from lpv_track_env.steady_turn import turn_steadily
 from trajectories.compilation import compiled, compiled_internal
-from trajectories.table import heading_at, position_at, speed_at
+from trajectories.table import SPEED, cell, curvature_at, heading_at, position_at, speed_at
 
 Array = NDArray[Any]
 Infos = dict[str, Any]
@@ -50,12 +51,21 @@ def error(given: Any, half: Any, key: Any, episode: Any, draw: int) -> Any:
 @compiled
 def begin(
     record: Array, constants: Array, table: Array, observation: Array,
-    key: Any, episode: Any, given: Array,
+    key: Any, episode: Any, given: Array, friction: Any,
 ) -> None:  # fmt: skip
     """Begin an episode: draw its start, set the state, write record and observation.
 
-    `given`, (5,) as `GIVEN` lists them in m, m, rad, m/s, m/s, replaces what would be drawn; NaN:
-    drawn. A vehicle that does not reverse starts at standstill rather than below it.
+    The vehicle starts in the steady turn of the path's curvature, moving along the path but for the
+    errors, and on a closed path with the reference's acceleration: as it would come round. One that
+    does not reverse starts at standstill rather than below it.
+
+    Parameters
+    ----------
+    given
+        (5,) as `GIVEN` lists them in m, m, rad, m/s, m/s, in place of what would be drawn; NaN:
+        drawn. A given heading error is that of the vehicle's axis, sideslip included.
+    friction
+        Coefficient of friction of tyres and road, inf for linear tyres.
     """
     p = constants
     s = given[0]
@@ -75,7 +85,20 @@ def begin(
     record[PSI] = heading + heading_error
     record[X] = x - lateral_error * math.sin(heading)
     record[Y] = y + lateral_error * math.cos(heading)
-    record[kernels.ACCELERATION] = p[ROLLING_DECELERATION]
+    curvature = curvature_at(table, length, closed, s)
+    steering, slowing = turn_steadily(record, p, curvature, friction, p[kernels.MAX_STEERING])
+    if not math.isnan(given[2]):
+        record[PSI] = heading + heading_error
+    record[kernels.STEERING] = steering
+    a = p[ROLLING_DECELERATION] + slowing
+    if closed:
+        cells = table.shape[0] - 1
+        index, _ = cell(s, length, closed, cells + 1)
+        before, after = table[index, SPEED], table[index + 1, SPEED]
+        a += 0.5 * (after * after - before * before) * cells / length
+    record[kernels.ACCELERATION] = kernels.clip(
+        a, p[kernels.LOWEST_ACCELERATION], p[kernels.HIGHEST_ACCELERATION]
+    )
     record[kernels.ARC_LENGTH] = s
     kernels.start(record, p, table, observation)
 

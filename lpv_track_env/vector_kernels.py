@@ -179,11 +179,11 @@ def begin_next(
     record, observation, constants = envs.records[i], envs.observations[i], envs.constants[case]
     table = envs.tables[envs.rows[case, 0] : envs.rows[case, 1]]
     if conditions is None:
-        begin(record, constants, table, observation, draws[0], draws[1], given)
+        begin(record, constants, table, observation, draws[0], draws[1], given, math.inf)
     else:
         begin_under_conditions(
             conditions.vehicles[i], record, conditions.specs[case], constants, table, observation,
-            draws, given,
+            draws, given, math.inf,
         )  # fmt: skip
 
 

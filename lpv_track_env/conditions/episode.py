@@ -122,17 +122,20 @@ def observe_estimate(
 @compiled
 def begin_under_conditions(
     m: Array, record: Array, spec: Array, constants: Array, table: Array, observation: Array,
-    draws: Array, given: Array,
+    draws: Array, given: Array, friction: Any,
 ) -> None:  # fmt: skip
     """Begin an episode under conditions: draw the conditions and the start.
 
-    `draws` holds key and number of the episode, (2,) uint64; `given` is as in `episodes.begin`.
+    `draws` holds key and number of the episode, (2,) uint64; `given` is as in `episodes.begin`;
+    `friction` is the plant's own, inf for the bicycle's.
     """
     key, episode = draws[0], draws[1]
-    begin(record, constants, table, observation, key, episode, given)
     for j in range(m.shape[0]):
         m[j] = 0.0
     sensors.draw_conditions(m, spec, key, episode)
+    drawn = m[layout.FRICTION]
+    friction = min(drawn, friction) if max(drawn, friction) == math.inf else drawn * friction
+    begin(record, constants, table, observation, key, episode, given, friction)
     for j in range(7):
         m[layout.PLANT + j] = constants[j]
     m[layout.PLANT] *= m[layout.MASS_FACTOR]

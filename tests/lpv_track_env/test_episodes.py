@@ -73,7 +73,7 @@ def test_start_lies_at_the_errors_asked_for() -> None:
     given = np.array([12.0, 0.5, -0.2, 1.5, math.nan])
     episodes.begin(
         record, env.task.constants(), env.path.table, observation,
-        np.uint64(0), 0, given,
+        np.uint64(0), 0, given, math.inf,
     )  # fmt: skip
     radius = math.hypot(record[4], record[5] - 30.0)
     # Left of a circle that turns left is inside.
@@ -81,7 +81,6 @@ def test_start_lies_at_the_errors_asked_for() -> None:
     assert record[2] == pytest.approx(12.0 / 30.0 - 0.2, abs=1e-9)
     assert record[0] == pytest.approx(float(env.path.sample(12.0).speed) + 1.5)
     assert record[kernels.ARC_LENGTH] == pytest.approx(12.0, abs=1e-9)
-    assert record[kernels.ACCELERATION] == env.vehicle.rolling_deceleration
     assert record[kernels.START] == record[kernels.ARC_LENGTH]
     assert record[kernels.STEPS] == 0.0
     assert not record[[kernels.END, *range(kernels.CLIPPED, kernels.RECORD_SIZE)]].any()
