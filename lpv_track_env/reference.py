@@ -31,7 +31,7 @@ from trajectories import ReferencePath, SpeedLimits
 from trajectories.arguments import Number, shown
 from trajectories.importers import imported
 from trajectories.naming import choose
-from trajectories.speed import constant_speed, replanned
+from trajectories.speed import constant_speed, keep_speed, replanned
 
 Array = NDArray[np.float64]
 
@@ -165,8 +165,12 @@ def reference(
     plant: str | plants.Factory = plants.BICYCLE,
     conditions: Conditions | None = None,
 ) -> ReferencePath:
-    """Load the path to track; set its speed as chosen, at most the vehicle's highest speed."""
-    path = trajectories.load(trajectory)
+    """Load the path to track; set its speed as chosen, within the vehicle's limits.
+
+    The speed of a file is planned for the vehicle, or the file's own. The latter is lowered to what
+    the vehicle can drive, any other one to its highest speed.
+    """
+    path = trajectories.load(trajectory, vehicle=car)
     if speed.grip is not None:
         ends = plants.friction_range(plants.episode_of(plant, car), conditions)
         limits = grip_limits(path, car, 0.5 * sum(ends), speed.grip)
@@ -175,11 +179,20 @@ def reference(
         chosen = constant_speed(path) if speed.fixed is None else speed.fixed
         path = path.with_speed(chosen, speed_mode="fixed")
     fastest = car.speed_range[1]
-    if path.speed.max() > fastest:
-        message = f"path {shown(path.name)}: speed lowered to the vehicle's {fastest:g} m/s"
+    lowered, why = np.minimum(path.speed, fastest), f"the vehicle's {fastest:g} m/s"
+    if speed.mode == "variable" and path.metadata.get("speeds") == "file":
+        hardest = SpeedLimits.hardest(car)
+        lowered = keep_speed(path.speed, path.curvature, path.spacing, hardest, closed=path.closed)
+        why = f"what vehicle {shown(car.name)} can drive"
+    cut = path.speed - lowered
+    if cut.max() > 1e-6:
+        message = (
+            f"path {shown(path.name)}: speed lowered to {why} on {100.0 * np.mean(cut > 1e-6):.0f} "
+            f"% of its length, by up to {cut.max():.3g} m/s"
+        )
         warnings.warn(message, UserWarning, stacklevel=4)
         noted = [*path.metadata.get("warnings", []), message]
-        path = path.with_speed(np.minimum(path.speed, fastest), warnings=noted)
+        path = path.with_speed(lowered, warnings=noted)
     if imported(path) and (bend := too_sharp_bend(path, car)):
         warnings.warn(bend, UserWarning, stacklevel=4)
     return path

@@ -1,6 +1,7 @@
 """References planned by grip: analytic answers, the axles' limits, vehicles and friction."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -193,3 +194,41 @@ def test_more_grip_is_faster_and_soft_tyres_are_slower() -> None:
     ]
     assert limits == sorted(limits, reverse=True)
     assert limits[0] == pytest.approx(GRAVITY, rel=1e-2)
+
+
+class TestFiles:
+    """A file's speed: its own up to what the vehicle can drive, or planned for the vehicle."""
+
+    @pytest.fixture
+    def raceline(self, tmp_path: Path) -> Path:
+        s = np.arange(0.0, 200.0, 1.0)
+        speed = np.where(s < 100.0, 6.0, 12.0)
+        file = tmp_path / "line.csv"
+        rows = [f"{x},0.0,{v}" for x, v in zip(s, speed, strict=True)]
+        file.write_text("\n".join(["x_m,y_m,vx_mps", *rows]))
+        return file
+
+    def test_own_speeds_are_driven_up_to_the_vehicles_acceleration(self, raceline: Path) -> None:
+        path = PathTrackingEnv(raceline, "m2-minibus").path
+        assert path.speed[0] == pytest.approx(6.0)
+        assert path.speed.max() == pytest.approx(12.0)
+        assert path.acceleration.max() == pytest.approx(2.0)
+        exact = np.sqrt(36.0 + 4.0 * (path.arc_length - 99.0).clip(0.0)).clip(max=12.0)
+        assert np.abs(path.speed - exact).max() < 0.5  # the nodes of the step from 6 to 12 m/s
+
+    def test_a_path_that_was_loaded_without_a_vehicle_is_lowered_too(self, raceline: Path) -> None:
+        whole = load(raceline)
+        assert whole.acceleration.max() > 20.0
+        with pytest.warns(UserWarning, match="lowered to what vehicle 'm2-minibus' can drive on"):
+            path = PathTrackingEnv(whole, "m2-minibus").path
+        assert np.array_equal(path.speed, PathTrackingEnv(raceline, "m2-minibus").path.speed)
+
+    def test_a_planned_speed_keeps_to_the_vehicle(self, tmp_path: Path) -> None:
+        file = tmp_path / "circle.csv"
+        angle = np.linspace(0.0, 2.0 * np.pi, 150)
+        np.savetxt(file, 40.0 * np.column_stack([np.cos(angle), np.sin(angle)]), delimiter=",")
+        sporty = CAR.replace(max_lateral_acceleration=0.5)
+        for car, lateral in ((CAR, 2.0), (sporty, 0.5)):
+            path = PathTrackingEnv(file, car).path
+            assert path.speed.max() == pytest.approx(math.sqrt(lateral * 40.0), rel=0.01)
+            assert path.metadata["limits"]["wheelbase"] == car.wheelbase
