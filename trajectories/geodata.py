@@ -334,7 +334,7 @@ def read_nmea(file: Path, part: str | None = None) -> RawPath:
     else:
         partial = 0
     raw = _path(file, "NMEA log", [Line(points)], part)
-    counts = ((wrong, "wrong checksum"), (without, "no fix"), (partial, "no speed"))
+    counts = ((wrong, "wrong checksum or torn"), (without, "no fix"), (partial, "no speed"))
     skipped = ", ".join(f"{count} with {why}" for count, why in counts if count)
     metadata = {**raw.metadata, "skipped": f"NMEA: {skipped}"} if skipped else raw.metadata
     return replace(raw, metadata=metadata)

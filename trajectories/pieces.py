@@ -19,8 +19,6 @@ Array = NDArray[np.float64]
 
 MEETS = 0.5
 """m: ends of pieces of a road map that are further apart do not meet."""
-MOST_PIECES = 1000
-"""Most pieces of a route."""
 NAMES_SHOWN = 12
 
 
@@ -89,9 +87,11 @@ class Pieces:
         """
         taken = self.longest if part is None else part
         steps = [step.strip() for step in taken.split(",")]
-        if len(steps) > MOST_PIECES:
-            self.fail(f"part names {len(steps)} {self.noun}s, at most {MOST_PIECES} are read")
-        pieces = [self._step(step) for step in steps]
+        with np.errstate(over="ignore", invalid="ignore"):
+            pieces = [self._step(step) for step in steps]
+        for step, piece in zip(steps, pieces, strict=True):
+            if not all(np.isfinite(values).all() for values in piece.columns.values()):
+                self.fail(f"{self.noun} {shortened(step, 40)} has numbers that are too large")
         joined = pieces[0] if len(pieces) == 1 else self._joined(steps, pieces)
         metadata = {**self.metadata, **joined.metadata}
         if len(self.names) > 1 or part is not None:
@@ -116,7 +116,7 @@ class Pieces:
         self.fail(f"has no {self.noun} {shown(name)}: it has {known}{more}")
 
     def _step(self, step: str) -> Piece:
-        if step not in self.names and step.startswith("-"):
+        if step.startswith("-") and step not in self.names:
             return self.read(step[1:].strip()).backwards()
         return self.read(step)
 

@@ -143,14 +143,11 @@ def _reference_line(found: _Map, road: Element, what: str) -> Frame:
         if length < SHORTEST:
             continue
         at = np.linspace(0.0, length, math.ceil(length / STEP) + 1)
-        with np.errstate(over="ignore", invalid="ignore"):
-            u, v, turned = _local(found, geometry, at, where)
-            cosine, sine = math.cos(heading), math.sin(heading)
-            frame = Frame(
-                s + at, x + u * cosine - v * sine, y + u * sine + v * cosine, heading + turned
-            )
-        if not np.isfinite(frame).all():
-            raise found.refuse(f"{where}: its numbers are too large")
+        u, v, turned = _local(found, geometry, at, where)
+        cosine, sine = math.cos(heading), math.sin(heading)
+        frame = Frame(
+            s + at, x + u * cosine - v * sine, y + u * sine + v * cosine, heading + turned
+        )
         if parts:
             gap = math.hypot(frame.x[0] - parts[-1].x[-1], frame.y[0] - parts[-1].y[-1])
             if gap > MEETS:
