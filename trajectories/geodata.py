@@ -67,10 +67,10 @@ class Line:
             if len(known) == len(self.fixes):
                 columns[key] = np.array(known)
             elif known:
-                missing.append(f"{key} of {len(self.fixes) - len(known)} points")
+                missing.append(f"{key} not used: {len(self.fixes) - len(known)} points lack it")
         if "time" in columns:
             columns["time"] = columns["time"] - columns["time"][0]
-        metadata = {"missing": ", ".join(missing)} if missing else {}
+        metadata = {"missing": "; ".join(missing)} if missing else {}
         return Piece(columns, [fix.place for fix in self.fixes], self.closed, metadata)
 
 

@@ -45,6 +45,8 @@ MINIMUM_LENGTH, MAXIMUM_LENGTH = 1.0, 30_000.0
 """m: other lengths suggest that the coordinates are not metres."""
 LARGEST_COORDINATE = 1e7
 """m: larger coordinates are not on any map of the Earth."""
+SAID = ("part", "missing", "skipped")
+"""Metadata of readers that belong in the line of what was imported."""
 BINDING = {
     "top speed": ("max_speed",),
     "lateral acceleration": ("max_lateral_acceleration",),
@@ -195,7 +197,7 @@ class _Import:
         self.options = options
         self.geographic = "latitude" in raw.columns
         self.warnings: list[str] = []
-        self.notes: list[str] = []
+        self.notes = [str(raw.metadata[key]) for key in SAID if key in raw.metadata]
         self.metadata = dict(raw.metadata)
         if not raw.places:
             raw.fail("has no points")

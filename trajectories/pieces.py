@@ -96,9 +96,10 @@ class Pieces:
         metadata = {**self.metadata, **joined.metadata}
         if len(self.names) > 1 or part is not None:
             plural = "s" if len(steps) > 1 else ""
-            why = "" if part is not None else ", the longest: others with the option part"
+            of = " of" if part is not None else ", the longest of"
+            more = "" if part is not None else " (the option part names others)"
             metadata["part"] = (
-                f"{self.noun}{plural} {shortened(taken, 60)} of {len(self.names)}{why}"
+                f"{self.noun}{plural} {shortened(taken, 60)}{of} {len(self.names)}{more}"
             )
         return RawPath(
             self.kind, str(self.file), self.file.stem, joined.columns, joined.places,

@@ -86,9 +86,9 @@ def test_databases_are_told_apart(tmp_path: Path) -> None:
     for statement, words in (
         ("CREATE TABLE topics(id INTEGER PRIMARY KEY)", "a rosbag2 database"),
         ("CREATE TABLE gpkg_contents(table_name TEXT)", "a GeoPackage"),
-        ("CREATE TABLE points(x REAL)", "an SQLite database"),
+        ("CREATE TABLE points(x REAL)", "a SQLite database"),
     ):
-        folder = tmp_path / words[-8:]
+        folder = tmp_path / words
         folder.mkdir()
         content = database(statement, folder)
         with pytest.raises(ValueError, match=words):

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import ellipeinc
 
+from trajectories import load
 from trajectories.formats import reader_of
 from trajectories.raw_path import RawPath
 
@@ -136,6 +138,34 @@ def test_content_counts_before_the_suffix_and_a_byte_order_mark_is_no_harm(
         assert len(places(read(tmp_path / "wide.xml", wide))) == 120
 
 
+@pytest.mark.parametrize("kind", ["gpx", "kml", "geojson", "nmea", "csv"])
+def test_the_lap_is_loaded_as_from_a_table(kind: str, tmp_path: Path) -> None:
+    if kind == "nmea":
+        pytest.importorskip("pynmea2", reason="pynmea2 is not installed")
+    table = "lat,lon\n" + "".join(f"{a:.8f},{b:.8f}\n" for a, b in POINTS)
+    file = tmp_path / f"lap.{kind}"
+    file.write_text(table if kind == "csv" else lap_of(kind))
+    path = load(file)
+    around = 2.0 * 60.0 * ellipeinc(2.0 * math.pi, 1.0 - 0.25) / 2.0
+    assert path.closed
+    assert path.length == pytest.approx(around, rel=2e-3)  # and the smoothing cuts bends a little
+    assert path.metadata["imported"].startswith(path.metadata["source"].split(":")[0])
+
+
+def test_what_was_taken_of_a_file_is_in_the_line_of_the_import(tmp_path: Path) -> None:
+    file = tmp_path / "many.gpx"
+    file.write_text(
+        gpx(
+            f"<trk><trkseg>{segment(POINTS[:40])}</trkseg>"
+            f"<trkseg>{segment(POINTS[40:])}</trkseg></trk>"
+        )
+    )
+    longest = "part 2, the longest of 2 (the option part names others)"
+    assert longest in load(file).metadata["imported"]
+    assert load(file, part=1).length < load(file, part="2").length
+    assert "; part 1 of 2" in load(file, part=1).metadata["imported"]
+
+
 # --- GPX ---
 
 
@@ -150,7 +180,7 @@ def test_gpx_takes_the_longest_segment_unless_a_part_is_named(tmp_path: Path) ->
     file = tmp_path / "many.gpx"
     raw = read(file, text)
     assert places(raw) == long
-    assert raw.metadata["part"] == "part 2 of 3, the longest: others with the option part"
+    assert raw.metadata["part"] == "part 2, the longest of 3 (the option part names others)"
     assert places(read(file, text, "1")) == short
     assert places(read(file, text, "3")) == route
     assert places(read(file, text, "-1")) == short[::-1]
@@ -191,7 +221,7 @@ def test_a_quantity_that_some_points_lack_is_left_out_and_said(tmp_path: Path) -
     )
     raw = read(tmp_path / "holes.gpx", text)
     assert set(raw.columns) == {"latitude", "longitude"}
-    assert raw.metadata["missing"] == "height of 3 points"
+    assert raw.metadata["missing"] == "height not used: 3 points lack it"
 
 
 @pytest.mark.parametrize(
@@ -263,7 +293,7 @@ def test_geojson_geometries(tmp_path: Path) -> None:
     lines = {"type": "MultiLineString", "coordinates": [lonlat(POINTS[:9]), lonlat(POINTS[9:])]}
     raw = read(file, json.dumps(lines))
     assert places(raw) == POINTS[9:]
-    assert raw.metadata["part"].startswith("part 2 of 2, the longest")
+    assert raw.metadata["part"].startswith("part 2, the longest of 2")
     ring = [*POINTS, POINTS[0]]
     polygon = {"type": "Polygon", "coordinates": [lonlat(ring)]}
     raw = read(file, json.dumps({"type": "Feature", "geometry": polygon, "properties": None}))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import fresnel
 
+from trajectories import load
 from trajectories.formats import reader_of
 from trajectories.raw_path import RawPath
 
@@ -60,6 +61,8 @@ def test_a_straight_road(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found[:, 0], np.linspace(0.0, 50.0, 101))
     assert not found[:, 1].any()
     assert "part" not in raw.metadata
+    path = load(tmp_path / "40.xodr")
+    assert (path.closed, path.length) == (False, pytest.approx(50.0, abs=1e-6))
 
 
 def test_an_arc_lies_on_its_circle(tmp_path: Path) -> None:
@@ -150,7 +153,7 @@ def test_the_longest_road_unless_a_route_is_named(tmp_path: Path) -> None:
         header="<geoReference><![CDATA[+proj=utm +zone=32 +datum=WGS84]]></geoReference>",
     )
     raw = read(file, text)
-    assert raw.metadata["part"] == "road 7 of 3, the longest: others with the option part"
+    assert raw.metadata["part"] == "road 7, the longest of 3 (the option part names others)"
     assert raw.metadata["geo_reference"] == "+proj=utm +zone=32 +datum=WGS84"
     assert points(read(file, text, "12"))[-1].tolist() == [20.0, 0.0]
     raw = read(file, text, "12,7,-9")
@@ -236,6 +239,24 @@ def test_flaws_of_roads_are_named(text: str, message: str, tmp_path: Path) -> No
         read(tmp_path / "bad.xodr", text)
 
 
+def test_a_route_is_loaded_as_a_path(tmp_path: Path) -> None:
+    """A straight, a quarter of a circle of 20 m, and a straight that is drawn backwards."""
+    file = tmp_path / "route.xodr"
+    file.write_text(
+        drive(
+            road("a", geometry(LINE, 40.0)),
+            road("b", geometry('<arc curvature="0.05"/>', 10.0 * math.pi, at=(40.0, 0.0, 0.0))),
+            road("c", geometry(LINE, 40.0, at=(60.0, 60.0, -math.pi / 2))),
+        )
+    )
+    path = load(file, part="a,b,-c", smoothing=0.0)
+    assert path.length == pytest.approx(80.0 + 10.0 * math.pi, rel=1e-3)
+    assert path.heading[-1] == pytest.approx(math.pi / 2, abs=1e-3)
+    assert path.curvature[len(path.curvature) // 2] == pytest.approx(0.05, rel=0.05)
+    assert path.metadata["imported"].startswith("OpenDRIVE road of")
+    assert "roads a,b,-c of 3" in path.metadata["imported"]
+
+
 # --- CommonRoad ---
 
 
@@ -270,7 +291,10 @@ def test_a_lanelet_of_two_points_is_read(tmp_path: Path) -> None:
     raw = read(tmp_path / "41_commonroad.xml", scenario(straight(1, 0.0, 50.0)))
     found = points(raw)
     np.testing.assert_allclose(found[[0, -1]], [[0.0, 0.0], [50.0, 0.0]])
-    assert len(found) >= 4
+    path = load(tmp_path / "41_commonroad.xml")
+    assert path.length == pytest.approx(50.0, abs=1e-6)
+    assert path.widths is not None
+    np.testing.assert_allclose(path.widths, 2.0)
     assert (raw.columns["width_left"] == 2.0).all()
     assert (raw.columns["width_right"] == 2.0).all()
 
@@ -283,7 +307,7 @@ def test_the_longest_chain_of_successors(tmp_path: Path) -> None:
     )  # fmt: skip
     file = tmp_path / "chain.xml"
     raw = read(file, text)
-    assert raw.metadata["part"] == "lanelets 1,2 of 5, the longest: others with the option part"
+    assert raw.metadata["part"] == "lanelets 1,2, the longest of 5 (the option part names others)"
     assert points(raw)[[0, -1], 0].tolist() == [0.0, 60.0]
     assert (np.diff(points(raw)[:, 0]) > 0.0).all()
     assert points(read(file, text, "1,3"))[-1, 0] == 40.0
