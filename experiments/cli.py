@@ -3,13 +3,18 @@
 import argparse
 import importlib
 import io
+import logging
 import os
 import sys
-from collections.abc import Collection, Sequence
-from typing import Any, NoReturn
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from experiments.commands.options import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
 from experiments.run.engines import one_thread
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 COMMANDS = {
     "benchmark": "Run agents x trajectories x seeds, print the paper's table, write report.html.",
@@ -117,8 +122,35 @@ def run(options: argparse.Namespace) -> int:
 
     # Piped output keeps the tables' width; a terminal, or COLUMNS, has its own.
     wide = None if sys.stdout.isatty() or "COLUMNS" in os.environ else 120
-    code: int = module_of(options.command).run(options, Console(width=wide))
+    console = Console(width=wide)
+    with _imports_said(console):
+        code: int = module_of(options.command).run(options, console)
     return code
+
+
+@contextmanager
+def _imports_said(console: "Console") -> Iterator[None]:
+    """Print what this process's imports of paths from files say of themselves, each line once."""
+    from trajectories.arguments import shortened
+
+    process, said = os.getpid(), set()
+
+    def once(record: logging.LogRecord) -> bool:
+        line = shortened(record.getMessage(), LONGEST_LINE)
+        if os.getpid() == process and line not in said:
+            said.add(line)
+            console.out(line, highlight=False)
+        return True
+
+    log = logging.getLogger("trajectories.importers")
+    level = log.level
+    log.setLevel(logging.INFO)
+    log.addFilter(once)
+    try:
+        yield
+    finally:
+        log.removeFilter(once)
+        log.setLevel(level)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -148,8 +148,13 @@ def load(
             return files.read(_file(trajectory), options)
         trajectory = path
     if given := options.given():
-        raise ValueError(f"{given[0]} belongs to files, but {shown(trajectory.name)} is none")
+        raise ValueError(f"{given[0]} is an option of files, and {shown(trajectory.name)} is none")
     return trajectory
+
+
+def is_file(trajectory: str | Path) -> bool:
+    """Return whether `load` takes a text for a file's name."""
+    return _built_in(str(trajectory)) is None
 
 
 def _built_in(name: str) -> ReferencePath | None:

@@ -5,6 +5,7 @@ resampling at 0.25 m of arc length, heading and curvature from the spline's deri
 speed: that of the file as far as the limits allow, or a planned jerk-limited profile.
 """
 
+import logging
 import math
 import warnings
 from collections.abc import Mapping
@@ -29,6 +30,7 @@ from trajectories.speed_limits import SpeedLimits
 
 Array = NDArray[np.float64]
 
+LOG = logging.getLogger(__name__)
 SMOOTHING = 0.05
 """m rms: removes the jitter of points 5 m apart (on one track the largest curvature falls from
 0.162 to 0.104 1/m)."""
@@ -180,14 +182,16 @@ def path_of(raw: RawPath, options: ImportOptions = USUAL) -> ReferencePath:
     """Make a path of the points of a file or an array.
 
     Its metadata tell the source, the deviation of the path from the points, warnings, and in one
-    line, `imported`, what was made of the points and their speeds.
+    line, `imported`, what was made of the points and their speeds; this line is logged, too.
 
     Raises
     ------
     ValueError
         If the points are no drivable path; the message names the file and the point.
     """
-    return _Import(raw, options).path()
+    path = _Import(raw, options).path()
+    LOG.info("%s: %s", raw.origin, path.metadata["imported"])
+    return path
 
 
 class _Import:

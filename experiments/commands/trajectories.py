@@ -46,6 +46,29 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--section", nargs=2, type=shared.number(0.0, unit="m"), metavar=("START", "END"),
         help="only the part between these arc lengths, m, as an open path",
     )  # fmt: skip
+    files = parser.add_argument_group("files", "options of trajectories.load(...), for files")
+    files.add_argument(
+        "--vehicle", metavar="NAME", help="preset or .json whose limits the speed keeps"
+    )
+    for option, meaning in (
+        ("--max-speed", "m/s"),
+        ("--max-lateral-acceleration", "m/s^2"),
+        ("--max-acceleration", "m/s^2"),
+        ("--smoothing", "m rms between path and points (default 0.05, 0.2 for GPS)"),
+        ("--minimum-distance", "m between points; leaves out jitter and standstill"),
+        ("--scale", "factor on all coordinates"),
+    ):
+        files.add_argument(option, type=shared.number(0.0), metavar="X", help=meaning)
+    ends = files.add_mutually_exclusive_group()
+    ends.add_argument("--closed", action="store_true", default=None, help="the end meets the start")
+    ends.add_argument("--open", action="store_false", dest="closed", help="it does not")
+    files.add_argument(
+        "--columns", nargs="+", metavar="NAME",
+        help="names of a table's columns, e.g. x y v_kmh; - leaves one out",
+    )  # fmt: skip
+    files.add_argument("--speeds", choices=("file", "planned"), help="default: the file's, if any")
+    files.add_argument("--speed-unit", metavar="UNIT", help="m/s, km/h, mph or kn")
+    files.add_argument("--part", metavar="NAME", help="track, road or lanelet (default: longest)")
     shared.add_settings(
         parser, "--plan",
         "plan the speed anew: limits of trajectories.SpeedLimits, in SI units, the path's own "
@@ -63,7 +86,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from trajectories.speed import replanned
 
     names = options.names or [*SIX, *RAW]
-    paths = [trajectories.load(name) for name in names]
+    given = import_options(options, names)
+    paths = [trajectories.load(name, **given) for name in names]
     if options.section is not None:
         paths = [path.section(*options.section) for path in paths]
     if options.plan:
@@ -83,6 +107,30 @@ def run(options: argparse.Namespace, console: Console) -> int:
             f"{len(paths)} paths written to {options.write}", markup=False, soft_wrap=True
         )
     return 0
+
+
+def import_options(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
+    """Return the options of `trajectories.load` that were given.
+
+    Raises
+    ------
+    ValueError
+        If a vehicle is unknown, or is given for a path that ships.
+    """
+    from dataclasses import fields
+
+    from lpv_track_env.vehicle import load
+    from trajectories.arguments import shown
+    from trajectories.catalog import is_file
+    from trajectories.import_options import ImportOptions
+
+    known = [item.name for item in fields(ImportOptions)]
+    given = {key: value for key in known if (value := getattr(options, key, None)) is not None}
+    if "vehicle" in given:
+        given["vehicle"] = load(given["vehicle"])
+        if others := [name for name in names if not is_file(name)]:
+            raise ValueError(f"vehicle is an option of files, and {shown(others[0])} is none")
+    return given
 
 
 def limits_of(path: "ReferencePath", given: Mapping[str, Any]) -> "SpeedLimits":
