@@ -55,12 +55,14 @@ _NAME = re.compile(r"(.*?)\s*(?:[(\[]([^)\]]*)[)\]])?", re.DOTALL)
 """Name and unit of a column."""
 _MESSAGE = re.compile(r"^.*_(?=position_[xy]$|linear_x$)")
 """Names of ROS messages before a field, as in `field.pose.pose.position.x`."""
+UNNEEDED = ("height", "time", "sideways")
+"""Quantities that another unit makes another thing, such as a temperature."""
 IGNORED = "-"
 """Name of a column that is not read."""
 
 
 class Column(NamedTuple):
-    """A column's quantity, the rank of its name, and the factor that makes its unit the usual."""
+    """A column's quantity, the rank of its name, and its unit in the usual one, NaN if unknown."""
 
     quantity: str
     rank: int
@@ -68,14 +70,13 @@ class Column(NamedTuple):
 
 
 def known(name: str) -> Column | None:
-    """Return what a column's name says; None for an unknown name or unit."""
+    """Return what a column's name says; None for an unknown one."""
     words, unit = _NAME.fullmatch(name.lower()).groups()  # type: ignore[union-attr]
     plain = re.sub(r"[\s./-]+", "_", words.strip())
     found = KNOWN.get(_MESSAGE.sub("", plain))
     if found is None or unit is None:
         return None if found is None else Column(*found)
-    factor = NAMES[found[0]][0].get(unit.strip())
-    return None if factor is None else Column(*found[:2], factor)
+    return Column(*found[:2], NAMES[found[0]][0].get(unit.strip(), math.nan))
 
 
 def read_points(
@@ -117,9 +118,10 @@ class _Points:
         self.table, self.options = table, options
         self.found: dict[str, tuple[int, int, float]] = {}
         for index, column in enumerate(map(known, table.header)):
-            if column is not None:
-                better = (column.rank, index, column.factor)
-                self.found[column.quantity] = min(better, self.found.get(column.quantity, better))
+            if column is None or (column.quantity in UNNEEDED and math.isnan(column.factor)):
+                continue
+            better = (column.rank, index, column.factor)
+            self.found[column.quantity] = min(better, self.found.get(column.quantity, better))
 
     def __contains__(self, quantities: str) -> bool:
         return set(quantities.split()) <= self.found.keys()
@@ -127,6 +129,10 @@ class _Points:
     def read(self, quantity: str) -> Array:
         """Return a quantity (n,) in its usual unit."""
         _, index, factor = self.found[quantity]
+        if math.isnan(factor):
+            name = shown(self.table.header[index])
+            units = ", ".join(NAMES[quantity][0])
+            self.table.fail(f"the unit in the column's name {name} is none of {units}")
         return self.table.column(index) * factor
 
     def raw_path(self) -> RawPath:

@@ -168,7 +168,7 @@ def path_of_arrays(
         if not np.isfinite(values).all():
             index = int(np.argwhere(~np.isfinite(values))[0][0])
             raise ValueError(f"{name}[{index}] is {values[index]}: it must be finite")
-        columns |= zip(keys, values.reshape(n, -1).T, strict=True)
+        columns |= zip(keys, np.atleast_2d(values.T), strict=True)
     raw = RawPath("waypoints", "array", "waypoints", columns, [f"point {k}" for k in range(n)])
     return path_of(raw, given)
 
@@ -225,7 +225,7 @@ class _Import:
             self.warn(oddity)
         said = (
             f"{raw.kind} of {len(before.places)} points: {'closed' if closed else 'open'}, "
-            f"{smoothed.geometry.arc_length[-1]:.1f} m, at most {smoothed.max_deviation:.2g} m "
+            f"{smoothed.geometry.arc_length[-1]:.1f} m, at most {smoothed.max_deviation:.3f} m "
             "beside them"
         )
         self.notes.insert(0, said)
@@ -270,9 +270,9 @@ class _Import:
             columns["x"], columns["y"] = self._projected(raw)
         elif options.origin is not None:
             raw.fail("origin belongs to latitudes and longitudes, but it has metres")
-        elif options.scale == 1.0 and len(raw.places) >= MINIMUM_POINTS:
+        elif options.scale == 1.0:
             points = _points(raw)
-            if np.ptp(points, axis=0).max() < 0.5 and np.abs(points).max() <= 180.0:
+            if 0.0 < np.ptp(points, axis=0).max() < 0.5 and np.abs(points).max() <= 180.0:
                 raw.fail(
                     "all points lie within 0.5 m and look like degrees: name the columns lat,lon "
                     "to have them read as a GPS log, or give a scale if they are lengths"
@@ -403,6 +403,7 @@ class _Import:
         if given.max() < MINIMUM_SPEED:
             self.warn(f"its speeds, in {column}, are all 0: planned instead")
             return None
+        self._compare_times(raw)
         squared = _at_nodes(given**2, smoothed)
         s, n = smoothed.geometry.arc_length, len(smoothed.geometry.arc_length)
         stops = smoothed.places[: len(given)][given < MINIMUM_SPEED]
@@ -417,7 +418,11 @@ class _Import:
         speed = kept_to(limits)
         cut = wanted - speed
         k = int(np.argmax(cut))
-        said = f"speeds of {column}, {given.min():.3g} to {given.max():.3g} m/s"
+        lateral = float((speed**2 * np.abs(curvature)).max())
+        said = (
+            f"speeds of {column}, {given.min():.3g} to {given.max():.3g} m/s, up to "
+            f"{lateral:.2g} m/s² laterally"
+        )
         if cut[k] < 1e-3:
             self.notes.append(f"{said}, kept")
             return speed
@@ -430,6 +435,19 @@ class _Import:
             f"{cut[k]:.2f} m/s at {s[k]:.0f} m ({min(alone, key=lambda one: alone[one])})"
         )
         return speed
+
+    def _compare_times(self, raw: RawPath) -> None:
+        """Warn of speeds that are in km/h by the times of the points."""
+        if "time" not in raw.columns:
+            return
+        speed, steps = raw.columns["speed"], np.diff(raw.columns["time"])
+        driven = 0.5 * (speed[1:] + speed[:-1]) * steps
+        distances = np.hypot(*np.diff(_points(raw), axis=0).T) / self.options.scale
+        if 3.2 < np.median(driven / distances) < 4.0:
+            self.warn(
+                "its speeds are 3.6 times those that follow from its times: if they are in km/h, "
+                "say so by speed_unit"
+            )
 
 
 def _points(raw: RawPath) -> Array:

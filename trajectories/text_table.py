@@ -70,9 +70,9 @@ def read_lines(file: str | Path) -> list[str]:
 def read_table(file: str | Path, known: Callable[[str], object]) -> TextTable:
     """Split a text file at `;`, `,`, tabs or blanks; commas are decimal ones unless they separate.
 
-    A header is a line before the first row with a number, a comment (`#`, `%`) or not, of as many
-    cells as the rows: the last one of which two names, in lower case, are `known`, or else the last
-    one that is no comment.
+    The first line with two numbers is the first row. A header is a line before it, a comment (`#`,
+    `%`) or not, with as many cells: the last one of which two names, in lower case, are `known`, or
+    else the last one that is no comment.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def read_table(file: str | Path, known: Callable[[str], object]) -> TextTable:
         if not rows:
             separator = _separator(text)
         cells = _split(text, separator)
-        if not rows and not any(is_number(cell, separator) for cell in cells):
+        if not rows and sum(is_number(cell, separator) for cell in cells) < 2:
             heads.append(text)
             continue
         rows.append(cells)
@@ -113,17 +113,17 @@ def read_table(file: str | Path, known: Callable[[str], object]) -> TextTable:
 def _header(
     heads: Sequence[str], width: int, separator: str | None, known: Callable[[str], object]
 ) -> tuple[str, ...]:
-    """Return the names in the lines before the first row, (width,) or () if none are there."""
+    """Return the names in the lines before the first row, () if none are there."""
     header: tuple[str, ...] = ()
     for text in reversed(heads):
+        comment = text[0] in "#%"
         for sign in (separator, *SEPARATORS):
             names = tuple(cell.lower() for cell in _split(text.lstrip("#% \t"), sign))
-            if len(names) == width:
-                if sum(known(name) is not None for name in names) >= 2:
-                    return names
-                if not header and text[0] not in "#%":
-                    header = names
-                break
+            fits = len(names) == width
+            if (fits or not comment) and sum(known(name) is not None for name in names) >= 2:
+                return names
+            if fits and not header and not comment:
+                header = names
     return header
 
 

@@ -215,7 +215,6 @@ class Case(BaseCase):
         weights = self.agent_settings.get("weights")
         if self.agent in agents.names() and isinstance(weights, Mapping):
             weights_from(weights)
-        trajectories.load(self.trajectory)
         instance_of("regime", self.regime, str, "text")
         speed = SpeedChoice(self.speed_mode, self.fixed_speed, self.grip)
         given = conditions.load(self.plain_conditions)
@@ -228,6 +227,7 @@ class Case(BaseCase):
         for key in self.vehicle_changes:
             choose("vehicle field", key, VEHICLE_FIELDS)
         car = self.make_vehicle()
+        trajectories.load(self.trajectory, vehicle=car)
         plant = self.env_settings.get("plant", plants.BICYCLE)
         plants.make(plant, car)
         if self.start:

@@ -1,0 +1,179 @@
+"""Tables of points as other tools write them: separators, headers, units, decimal commas."""
+
+import math
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trajectories import ReferencePath, load
+from trajectories.columns import known
+
+ANGLE = 2.0 * math.pi * np.arange(120) / 120
+ELLIPSE = np.column_stack([60.0 * np.cos(ANGLE), 30.0 * np.sin(ANGLE)])
+LENGTH = 290.65
+"""m: circumference of the ellipse, 290.67 by Ramanujan's formula, less what smoothing takes."""
+
+
+def written(folder: Path, text: str, name: str = "points.csv") -> Path:
+    file = folder / name
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def rows(*columns: object, separator: str = ",", form: str = "{:.6f}") -> str:
+    """Lines of the ellipse's x and y, and of further columns, one value or one for each row."""
+    table = np.column_stack([ELLIPSE, *(np.broadcast_to(c, 120) for c in columns)])
+    lines = (separator.join(form.format(value) for value in row) for row in table.tolist())
+    return "\n".join(lines) + "\n"
+
+
+def is_ellipse(path: ReferencePath) -> bool:
+    away = np.abs((path.x / 60.0) ** 2 + (path.y / 30.0) ** 2 - 1.0)
+    return path.closed and abs(path.length - LENGTH) < 0.1 and bool(away.max() < 0.01)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        rows(separator=" "),
+        rows(separator="\t"),
+        rows(separator="  ", form="{:.18e}"),  # numpy.savetxt, MATLAB's -ascii
+        rows(separator="; "),
+        rows(separator=";", form="{:.3f}").replace(".", ","),
+        rows(separator="\t", form="{:.3f}").replace(".", ","),
+        rows(separator=" ", form="{:.3f}").replace(".", ","),
+        "x y\n" + rows(separator=" "),
+        "# x y\n" + rows(),
+        "% written by a tool\n" + rows(),
+        "Session;2026\n" + "x;y\n" + rows(separator=";"),
+        '"x","y"\n' + rows().replace("60.000000,", '"60.000000",', 1),
+        "X [m],Y [m]\n" + rows(),
+        "x (mm),y (mm)\n" + "".join(f"{1e3 * x:.1f},{1e3 * y:.1f}\n" for x, y in ELLIPSE),
+        "utm_e,utm_n\n" + rows(),
+        "field.pose.pose.position.x,field.pose.pose.position.y\n" + rows(),
+        "/odom/pose/pose/position/x,/odom/pose/pose/position/y\n" + rows(),
+        rows().replace("\n", "\r\n"),
+        "\ufeff" + rows(),
+    ],
+    ids=lambda text: text[:18],
+)  # fmt: skip
+def test_two_columns_are_read_however_they_are_separated(text: str, tmp_path: Path) -> None:
+    assert is_ellipse(load(written(tmp_path, text, "points.txt")))
+
+
+@pytest.mark.parametrize(
+    ("header", "columns", "speed"),
+    [
+        ("x,y,v", (3.0,), 3.0),
+        ("x,y,z,yaw,velocity,change_flag", (10.0, 0.0, 12.0, 0.0), 12.0),  # Autoware
+        ("X,Y,Z,A,C,V", (0.2, 1.6, 0.0, 7.0), 7.0),  # OpenPlanner, for CARLA and Autoware
+        ("x,y,v_kmh", (36.0,), 10.0),
+        ("x,y,Speed (km/h)", (36.0,), 10.0),
+        ("x,y,Speed [mph]", (10.0,), 4.4704),
+        ("x,y,speed_kn", (10.0,), 5.144444),
+        ("x,y,vx,vy", (3.0, 4.0), 5.0),
+        ("x,y,vx_mps,ax_mps2", (3.0, 0.0), 3.0),
+        ("# x_m,y_m,w_tr_right_m,w_tr_left_m,vx_racetraj_mps", (4.0, 4.0, 20.0), 20.0),
+    ],
+)
+def test_speeds_are_found_by_name_and_unit(
+    header: str, columns: tuple[float, ...], speed: float, tmp_path: Path
+) -> None:
+    path = load(written(tmp_path, f"{header}\n{rows(*columns)}"))
+    assert is_ellipse(path)
+    np.testing.assert_allclose(path.speed, speed, rtol=1e-6)
+    assert path.metadata["speeds"] == "file"
+
+
+def test_a_raceline_of_the_tum_has_comments_before_its_header(tmp_path: Path) -> None:
+    text = (
+        "# 1b2c-uuid\n# hash of the ggv\n# s_m; x_m; y_m; psi_rad; kappa_radpm; vx_mps; ax_mps2\n"
+    )
+    s = 2.42 * np.arange(120)
+    values = np.column_stack([s, ELLIPSE, s, s, np.full(120, 3.0), s]).tolist()
+    lines = "\n".join("; ".join(f"{value:.7f}" for value in row) for row in values)
+    path = load(written(tmp_path, text + lines))
+    assert is_ellipse(path)
+    np.testing.assert_allclose(path.speed, 3.0)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_racing_line_lies_beside_its_reference_line(side: float, tmp_path: Path) -> None:
+    """The TUM's normal vectors point to the right, so that widths change with the offset."""
+    names = "x_ref_m y_ref_m width_right_m width_left_m x_normvec_m y_normvec_m alpha_m"
+    header = f"# {'; '.join([*names.split(), 's_racetraj_m', 'vx_racetraj_mps'])}\n"
+    radius, offset = 50.0, side * 2.0
+    outwards = np.column_stack([np.cos(ANGLE), np.sin(ANGLE)])  # right of counter-clockwise
+    columns = [radius * outwards, np.full((120, 2), 4.0), outwards, np.full((120, 1), offset)]
+    table = np.column_stack([*columns, np.zeros(120), np.full(120, 20.0)]).tolist()
+    lines = "\n".join("; ".join(map(repr, row)) for row in table)
+    path = load(written(tmp_path, header + lines), smoothing=0.0)
+    np.testing.assert_allclose(np.hypot(path.x, path.y), radius + offset, atol=1e-3)
+    assert path.widths is not None
+    np.testing.assert_allclose(path.widths, np.tile([4.0 - offset, 4.0 + offset], (len(path.x), 1)))
+    np.testing.assert_allclose(path.speed, 20.0)
+
+
+def test_a_phone_log_is_read_with_its_speeds(tmp_path: Path) -> None:
+    north, east = 111_205.0, 74_445.0  # m per degree at 48.15 degrees, within 0.1 %
+    header = '"Time (s)","Latitude (°)","Longitude (°)","Height (m)","Velocity (m/s)"\n'
+    degrees = (48.15 + ELLIPSE[:, 1] / north, 11.57 + ELLIPSE[:, 0] / east)
+    table = np.column_stack([np.arange(120.0), *degrees, np.full((120, 2), [500.0, 5.0])])
+    lines = "\n".join(",".join(f"{value:.8f}" for value in row) for row in table.tolist())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        path = load(written(tmp_path, header + lines))
+    assert path.closed
+    assert path.length == pytest.approx(290.7, rel=2e-3)
+    np.testing.assert_allclose(path.speed, 5.0)
+
+
+def test_columns_are_named_by_the_user(tmp_path: Path) -> None:
+    file = written(tmp_path, rows(7.0, 36.0, separator=" "))
+    with pytest.raises(ValueError, match="4 columns without a header: name them, by columns="):
+        load(file)
+    path = load(file, columns=("x", "y", "-", "v_kmh"))
+    assert is_ellipse(path)
+    np.testing.assert_allclose(path.speed, 10.0)
+    with pytest.raises(ValueError, match="has 4 columns, but 2 are named"):
+        load(file, columns=("x", "y"))
+    with pytest.raises(ValueError, match="column name 'wheel' is not known: known are x, y, v"):
+        load(file, columns=("x", "y", "-", "wheel"))
+    # They replace a header, too.
+    other = written(tmp_path, "a,b,c\n" + rows(2.0))
+    np.testing.assert_allclose(load(other, columns=["x", "y", "v"]).speed, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "x,y,v\n" + rows(math.nan).replace("nan", "fast"),
+            "line 2, column v: 'fast' is not a number",
+        ),
+        ("x,y,v\n" + rows(-1.0), "line 2: speed -1 m/s is negative"),
+        ("x,y,v (furlongs)\n" + rows(3.0), r"name 'v \(furlongs\)' is none of m/s, mps"),
+        ("x (ell),y (ell)\n" + rows(), r"name 'x \(ell\)' is none of m, km, cm, mm"),
+        ("x,y,v\n" + rows(), "line 2 has 2 columns, not 3"),
+        ('"x,y\n' * 3, "no rows of numbers"),
+    ],
+)
+def test_what_cannot_be_read_is_named(text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        load(written(tmp_path, text))
+    assert str(caught.value).isprintable()
+
+
+def test_names_of_columns_hold_quantity_and_unit() -> None:
+    for name, quantity, factor in (
+        ("x_m", "x", 1.0), ("East (km)", "x", 1e3), ("y_ref_m", "y", 1.0),
+        ("latitude_rad", "latitude", math.degrees(1.0)), ("t_ms", "time", 1e-3),
+        ("VX_MPS", "speed", 1.0), ("speed_km_h", "speed", 1 / 3.6), ("w_tr_left", "width_left", 1),
+    ):  # fmt: skip
+        found = known(name)
+        assert found is not None
+        assert (found.quantity, found.factor) == (quantity, pytest.approx(factor))
+    for name in ("", "-", "yaw", "psi_rad", "x_kg", "()", "acceleration_x", "\n"):
+        assert known(name) is None
