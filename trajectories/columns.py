@@ -117,11 +117,15 @@ class _Points:
     def __init__(self, table: TextTable, options: ImportOptions) -> None:
         self.table, self.options = table, options
         self.found: dict[str, tuple[int, int, float]] = {}
+        self.twins: dict[int, int] = {}
         for index, column in enumerate(map(known, table.header)):
             if column is None or (column.quantity in UNNEEDED and math.isnan(column.factor)):
                 continue
             better = (column.rank, index, column.factor)
-            self.found[column.quantity] = min(better, self.found.get(column.quantity, better))
+            held = self.found.setdefault(column.quantity, better)
+            if held[1] < index and held[::2] == better[::2]:
+                self.twins[held[1]] = index
+            self.found[column.quantity] = min(better, held)
 
     def __contains__(self, quantities: str) -> bool:
         return set(quantities.split()) <= self.found.keys()
@@ -129,6 +133,12 @@ class _Points:
     def read(self, quantity: str) -> Array:
         """Return a quantity (n,) in its usual unit."""
         _, index, factor = self.found[quantity]
+        if index in self.twins:
+            one, other = (shown(self.table.header[k]) for k in (index, self.twins[index]))
+            self.table.fail(
+                f"columns {one} and {other} may both be the {quantity}: name the columns, those "
+                f"that are not needed {IGNORED!r}"
+            )
         if math.isnan(factor):
             name = shown(self.table.header[index])
             units = ", ".join(NAMES[quantity][0])
@@ -149,6 +159,8 @@ class _Points:
         elif "x y" in self:
             kind = "x,y waypoints"
             columns = {q: self.read(q) for q in ("x", "y")}
+            if "time speed" in self:
+                columns["time"] = self._times(self.found["time"][1])
         else:
             self._fail()
         if "width_right width_left" in self:
@@ -180,14 +192,15 @@ class _Points:
         )
 
     def _times(self, index: int) -> Array:
-        """Read times (n,), s, from a column of numbers or of ISO 8601 stamps."""
+        """Read times (n,), s, from a column of numbers, of ISO 8601 stamps, or of times of day."""
         table = self.table
         if is_number(table.rows[0][index], table.separator):
             return self.read("time")
         stamps = np.empty(len(table.rows))
         for k, row in enumerate(table.rows):
             try:
-                stamps[k] = datetime.fromisoformat(row[index]).timestamp()
+                day = "" if "-" in row[index] else "1970-01-02T"
+                stamps[k] = datetime.fromisoformat(day + row[index]).timestamp()
             except (ValueError, OverflowError, OSError):
                 table.fail(f"line {table.lines[k]}: {shown(row[index])} is not a time")
         return stamps

@@ -64,7 +64,7 @@ class TextTable:
 
 def read_lines(file: str | Path) -> list[str]:
     """Read the lines of a text file of at most `MOST_BYTES`; errors as in `fileio.read_bytes`."""
-    return read_text(file, MOST_BYTES).split("\n")
+    return read_text(file, MOST_BYTES).replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
 def read_table(file: str | Path, known: Callable[[str], object]) -> TextTable:
@@ -72,7 +72,8 @@ def read_table(file: str | Path, known: Callable[[str], object]) -> TextTable:
 
     The first line with two numbers is the first row. A header is a line before it, a comment (`#`,
     `%`) or not, with as many cells: the last one of which two names, in lower case, are `known`, or
-    else the last one that is no comment.
+    else the last one that is no comment. Units may stand in a line of their own below it. A cell
+    that is empty in every row and beyond the header, after a last separator, is left out.
 
     Raises
     ------
@@ -103,6 +104,9 @@ def read_table(file: str | Path, known: Callable[[str], object]) -> TextTable:
     table = TextTable(Path(file), (), rows, lines, separator)
     table.check_size()
     header = _header(heads, len(rows[0]), separator, known)
+    if len(header) in {0, len(rows[0]) - 1} and len(rows[0]) > 2 and not any(r[-1] for r in rows):
+        rows = [row[:-1] for row in rows]
+        header = _header(heads, len(rows[0]), separator, known)
     width = len(header or rows[0])
     for row, number in zip(rows, lines, strict=True):
         if len(row) != width:
@@ -113,18 +117,27 @@ def read_table(file: str | Path, known: Callable[[str], object]) -> TextTable:
 def _header(
     heads: Sequence[str], width: int, separator: str | None, known: Callable[[str], object]
 ) -> tuple[str, ...]:
-    """Return the names in the lines before the first row, () if none are there."""
+    """Return the names in the lines before the first row, () if none are there.
+
+    Units in a line below known names are put behind these in brackets.
+    """
     header: tuple[str, ...] = ()
+    units = ("",) * width
     for text in reversed(heads):
         comment = text[0] in "#%"
         for sign in (separator, *SEPARATORS):
             names = tuple(cell.lower() for cell in _split(text.lstrip("#% \t"), sign))
             fits = len(names) == width
             if (fits or not comment) and sum(known(name) is not None for name in names) >= 2:
-                return names
+                return names if len(names) != width else tuple(map(_with_unit, names, units))
             if fits and not header and not comment:
-                header = names
+                header = units = names
     return header
+
+
+def _with_unit(name: str, unit: str) -> str:
+    plain = unit.strip("[]()- ")
+    return f"{name} [{plain}]" if plain else name
 
 
 def _separator(text: str) -> str | None:

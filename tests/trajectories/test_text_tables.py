@@ -177,3 +177,48 @@ def test_names_of_columns_hold_quantity_and_unit() -> None:
         assert (found.quantity, found.factor) == (quantity, pytest.approx(factor))
     for name in ("", "-", "yaw", "psi_rad", "x_kg", "()", "acceleration_x", "\n"):
         assert known(name) is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x,y\nm,m\n" + rows(),
+        "x,y,note\n[m],[m],\n" + rows(0.0),
+        "x,y\nmm,mm\n" + "".join(f"{1e3 * x:.1f},{1e3 * y:.1f}\n" for x, y in ELLIPSE),
+        "x,y\n" + rows().replace("\n", ",\n"),
+        rows().replace("\n", ",\n"),
+        "x,y\r" + rows().replace("\n", "\r"),
+        "sep=;\nx;y\n" + rows(separator=";", form="{:.3f}").replace(".", ","),
+    ],
+    ids=["units", "brackets", "mm", "last comma", "last comma without header", "CR", "Excel's sep"],
+)
+def test_lines_of_units_last_separators_and_old_line_ends(text: str, tmp_path: Path) -> None:
+    assert is_ellipse(load(written(tmp_path, text)))
+
+
+def test_speeds_take_the_unit_of_the_line_below_their_name(tmp_path: Path) -> None:
+    path = load(written(tmp_path, "x,y,v\nm,m,km/h\n" + rows(14.4)))
+    np.testing.assert_allclose(path.speed, 4.0, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"the unit in the column's name 'x \[ft\]' is none of m"):
+        load(written(tmp_path, "x,y,v\nft,ft,km/h\n" + rows(14.4)))
+
+
+@pytest.mark.parametrize("header", ["x,y,x,y", "/a/position/x,/a/position/y,/b/position/x,z"])
+def test_two_columns_that_may_be_meant_are_refused(header: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"columns '.*x' and '.*x' may both be the x: name the"):
+        load(written(tmp_path, f"{header}\n" + rows(0.0, 1.0)))
+    with pytest.raises(ValueError, match="distinct points"):
+        load(written(tmp_path, f"{header}\n" + rows(0.0, 1.0)), columns=["-", "-", "x", "y"])
+
+
+def test_times_of_day_are_times(tmp_path: Path) -> None:
+    steps = np.hypot(*np.diff(ELLIPSE, axis=0).T)
+    seconds = np.concatenate([[0.0], np.cumsum(steps)]) / 4.0
+    lines = [
+        f"2026-05-01;10:{int(t) // 60:02d}:{t % 60:06.3f};{x:.6f};{y:.6f};14.4"
+        for t, (x, y) in zip(seconds.tolist(), ELLIPSE.tolist(), strict=True)
+    ]
+    file = written(tmp_path, "date;time;x;y;speed\n" + "\n".join(lines))
+    with pytest.warns(UserWarning, match="if they are in km/h"):
+        path = load(file)
+    assert path.speed.max() == pytest.approx(14.4, rel=1e-6)
