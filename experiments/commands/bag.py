@@ -292,8 +292,8 @@ def _replay(options: argparse.Namespace, console: Console) -> int:
     from lpv_track_env.estimation.observer import PathObserver
     from trajectories.fileio import write_atomically
 
-    path = trajectories.load(options.trajectory)
     car = vehicle.load(options.vehicle)
+    path = trajectories.load(options.trajectory, vehicle=car)
     settings = agent_settings(options.agent_set, [options.agent])[options.agent]
     named = {
         kind: topic

@@ -20,6 +20,7 @@ from experiments.run.engines import Interrupts
 from experiments.run.folder_lock import locked
 from experiments.run.provenance import COMPUTING, computing_versions, file_digest
 from experiments.run.suites import CIRCUITS, HELD_OUT, LIMIT_PATHS, SIX
+from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
 from trajectories.arguments import shown
 from trajectories.fileio import checked, parse_json, read_bytes, read_json, write_atomically
@@ -268,12 +269,14 @@ def episode_seed(seed: int, number: int) -> int:
 
 
 def load_paths(
-    names: Sequence[str], tick: Callable[[int, int], None] = lambda *_: None
+    names: Sequence[str],
+    tick: Callable[[int, int], None] = lambda *_: None,
+    car: VehicleParameters | None = None,
 ) -> list[ReferencePath]:
-    """Load paths; `tick(done, all)` is called after each."""
+    """Load paths, those in files for a car; `tick(done, all)` is called after each."""
     paths = []
     for k, name in enumerate(names):
-        paths.append(trajectories.load(name))
+        paths.append(trajectories.load(name, vehicle=car))
         tick(k + 1, len(names))
     return paths
 

@@ -141,9 +141,8 @@ class Setup:
             raise ValueError(f"--watchdog must be at least 4 periods, not {self.watchdog}")
         choose("estimator", self.estimator, ESTIMATORS)
         check_settings(self.agent, self.agent_settings)
-        vehicle.load(self.vehicle)
         load(self.conditions)
-        trajectories.load(self.trajectory)
+        trajectories.load(self.trajectory, vehicle=vehicle.load(self.vehicle))
 
     @property
     def period(self) -> float:

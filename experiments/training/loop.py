@@ -32,6 +32,7 @@ from experiments.training.sb3_trainer import Sb3Trainer
 from experiments.training.settings import TrainingSettings
 from experiments.training.situations import NEAR
 from experiments.training.trainer import Trainer, make_learner_env, path_names
+from lpv_track_env import vehicle
 from trajectories.fileio import checked
 
 POLICY = "policy.json"
@@ -87,7 +88,8 @@ def train(
         claimed(folder, settings, "training", packages) as resumed,
         contextlib.ExitStack() as closing,
     ):
-        paths = load_paths(path_names(settings), listener.loading)
+        car = vehicle.load(settings.vehicle)
+        paths = load_paths(path_names(settings), listener.loading, car)
         logger = configure(str(folder / "tensorboard"), ["tensorboard"])
         closing.callback(logger.close)
         trainer = make_trainer(settings, paths, logger)

@@ -73,7 +73,8 @@ def tune(settings: TuningSettings, folder: Path, listener: Listener, *, command:
             write_settings(folder, settings)
             write_result(default, folder / WEIGHTS)
             return []
-        tuner = make_tuner(settings, load_paths(path_names(settings), listener.loading))
+        car = vehicle.load(settings.vehicle)
+        tuner = make_tuner(settings, load_paths(path_names(settings), listener.loading, car))
         if not (resumed and tuner.restore(folder)) and tuner.done:
             raise ValueError(
                 f"one step of {settings.method} takes {tuner.cost:,} solves: give more than "
