@@ -228,7 +228,8 @@ class _Import:
             f"{smoothed.geometry.arc_length[-1]:.1f} m, at most {smoothed.max_deviation:.3f} m "
             "beside them"
         )
-        self.notes.insert(0, said)
+        known = (self.metadata.get(key) for key in ("part", "missing", "skipped"))
+        self.notes[:0] = [said, *(str(note) for note in known if note)]
         speed = self._speed(raw, smoothed, closed)
         widths = None
         if "width_right" in raw.columns:
