@@ -18,7 +18,7 @@ from lpv_track_env.conditions import episode as conditions_episode
 from lpv_track_env.conditions import load as load_conditions
 from lpv_track_env.conditions.layout import FRICTION, ConditionedVehicle, info_of
 from lpv_track_env.draws import random_key
-from lpv_track_env.episodes import INFO, REWARD_TERMS, single_info
+from lpv_track_env.episodes import ENDS, INFO, single_info
 from lpv_track_env.observation import PREVIEW_PERIOD, PREVIEW_STEPS, ObservationLayout
 from lpv_track_env.plants import PlantEpisode
 from lpv_track_env.reference import SpeedChoice, reference
@@ -69,8 +69,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ## Reward
 
-    Sum of the named terms in `info["reward_terms"]`: progress, lateral, heading, speed, input_rate,
-    end, see `lpv_track_env.reward`. Perfect tracking gives 1 per second.
+    Sum of named terms, see `lpv_track_env.reward`, in `info["reward_progress"]` and so on: lateral,
+    heading, speed, input_rate, end. Perfect tracking gives 1 per second.
 
     ## Episode end
 
@@ -101,10 +101,10 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     ## Info
 
     `lateral_error, heading_error, speed_error, arc_length, state` (true state, (6,): vx, vy, psi,
-    r, X, Y), `reward_terms, clipped`, and at the end `end`. Under conditions other than
-    "simulation" the observation is made from an estimate, and there are `estimate` (6,),
-    `position_deviation` (m, of the filter in the worst direction; 0 without a filter), `stopping`
-    (the vehicle brakes, since fixes or commands are overdue) and `deadline_misses` (so far).
+    r, X, Y), `clipped`, the reward's terms and `end` ("" until it ends). Under conditions the
+    observation is made from an estimate, and there are `estimate` (6,), `position_deviation` (m, of
+    the filter in the worst direction; 0 without one), `stopping` (the vehicle brakes, since fixes
+    or commands are overdue) and `deadline_misses`. Keys, types and shapes never change.
 
     ## Arguments
 
@@ -395,8 +395,8 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise gymnasium.error.ResetNeeded(
                 "the episode has not begun or has ended: call reset() before step()"
             )
-        # Most of a step's time outside the kernel is spent here: few operations for the usual kind
-        # of action, checks for any other. A refused action leaves the episode untouched.
+        # Most of a step's time outside the kernel is spent here: few operations for the usual
+        # action, checks for any other. A refused action leaves the episode untouched.
         values = action.tolist() if type(action) is np.ndarray else action
         if type(values) is list and len(values) == 2:
             a, delta = values
@@ -409,11 +409,11 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         command[1] = delta
         # Copying and filling a dictionary is faster than writing a new one.
         info = INFO.copy()
-        info["reward_terms"] = terms = REWARD_TERMS.copy()
         (
             end, info["arc_length"], info["lateral_error"], info["heading_error"],
-            info["speed_error"], info["clipped"], reward, terms["progress"], terms["lateral"],
-            terms["heading"], terms["speed"], terms["input_rate"], terms["end"],
+            info["speed_error"], info["clipped"], reward, info["reward_progress"],
+            info["reward_lateral"], info["reward_heading"], info["reward_speed"],
+            info["reward_input_rate"], info["reward_end"],
         ) = self._advance(*self._arguments)  # fmt: skip
         info["state"] = self._state.copy()
         if self._conditioned is not None:
@@ -422,7 +422,7 @@ class PathTrackingEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if end:
             if end == kernels.NOT_FINITE:
                 check_finite(a, delta, action)
-            info["end"] = kernels.END_NAMES[end]
+            info["end"] = ENDS[end]
             truncated = end == kernels.TIME_LIMIT
             terminated = not truncated
             self._running = False

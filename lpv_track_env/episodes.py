@@ -5,6 +5,7 @@ the number of environments, on which of them were reset before, or on other draw
 """
 
 import math
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -21,20 +22,65 @@ from trajectories.table import SPEED, cell, curvature_at, heading_at, position_a
 Array = NDArray[Any]
 Infos = dict[str, Any]
 
+REWARD_KEYS = tuple(f"reward_{name}" for name in TERMS)
+"""Keys of the reward's terms in infos."""
+
 TRAJECTORY_DRAW, VEHICLE_DRAW, START_DRAW, LATERAL_DRAW, HEADING_DRAW, SPEED_DRAW = range(6)
 """Number of each draw within an episode."""
 
 GIVEN = ("arc_length", "lateral_error", "heading_error", "speed_error", "speed")
 """Starting values that reset options may give, in the order of `given` in `begin`."""
 
-INFO: Infos = dict.fromkeys(
-    (
-        "lateral_error", "heading_error", "speed_error", "arc_length", "state", "reward_terms",
-        "clipped",
-    )
-)  # fmt: skip
-REWARD_TERMS = dict.fromkeys(TERMS, 0.0)
-"""Infos and reward terms to be copied and filled, which is faster than to make them."""
+
+class End(IntEnum):
+    """How an episode ended, in infos: a number that equals its name, `info["end"] == "finished"`.
+
+    RL libraries gather infos in arrays of numbers and refuse texts. While the episode runs it is 0
+    and equals "". Its text is its name, as its hash is: sets of names contain it.
+    """
+
+    RUNNING = kernels.RUNNING
+    FINISHED = kernels.FINISHED
+    LEFT_CORRIDOR = kernels.LEFT_CORRIDOR
+    WRONG_HEADING = kernels.WRONG_HEADING
+    NON_FINITE = kernels.NON_FINITE
+    TIME_LIMIT = kernels.TIME_LIMIT
+    COLLISION = kernels.COLLISION
+
+    def __str__(self) -> str:
+        return kernels.END_NAMES[self.value] if self.value else ""
+
+    def __repr__(self) -> str:
+        return repr(str(self))
+
+    def __format__(self, spec: str) -> str:
+        return format(str(self), spec)
+
+    def __eq__(self, other: object) -> bool:
+        return (str(self) if isinstance(other, str) else self.value) == other
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    def __hash__(self) -> int:
+        return hash(str(self))
+
+
+ENDS = np.array(list(End), dtype=object)
+"""Ends by code."""
+INFO: Infos = {
+    **dict.fromkeys(
+        ("lateral_error", "heading_error", "speed_error", "arc_length", "state", "clipped")
+    ),
+    **dict.fromkeys(REWARD_KEYS),
+    "end": End.RUNNING,
+}
+"""Info to be copied and filled, which is faster than to make it.
+
+Infos have the same keys, types and shapes at the reset and in every step, numbers and arrays only:
+RL libraries preallocate arrays for them.
+"""
+MASKS = tuple(f"_{key}" for key in INFO)
 
 ROLLING_DECELERATION = 6
 """Index of mu g in the constants."""
@@ -103,9 +149,6 @@ def begin(
     kernels.start(record, p, table, observation)
 
 
-END_NAMES = np.array(kernels.END_NAMES, dtype=object)
-
-
 def episode_infos(records: Array, mask: Array | None = None) -> Infos:
     """Return infos of the episodes that `mask` (n,) marks, or of all; zeros for the others.
 
@@ -113,30 +156,26 @@ def episode_infos(records: Array, mask: Array | None = None) -> Infos:
     (n, RECORD_SIZE).
     """
     # One copy with a contiguous row for every entry.
+    everywhere = mask is None
     if mask is None:
         mask = np.ones(len(records), dtype=np.bool_)
         values = records.T.copy()
     else:
         values = np.zeros(records.T.shape)
         values[:, mask] = records[mask].T
-    terms: Infos = {}
-    for k, name in enumerate(TERMS):
-        terms[name], terms[f"_{name}"] = values[kernels.TERMS + k], mask
+    ends = ENDS[values[kernels.END].astype(np.int64)]
     infos: Infos = {
         "lateral_error": values[kernels.LATERAL_ERROR],
         "heading_error": values[kernels.HEADING_ERROR],
         "speed_error": values[kernels.SPEED_ERROR],
         "arc_length": values[kernels.ARC_LENGTH],
         "state": np.ascontiguousarray(values[:6].T),
-        "reward_terms": terms,
         "clipped": values[kernels.CLIPPED].astype(np.int64),
+        **dict(zip(REWARD_KEYS, values[kernels.TERMS :], strict=True)),
+        "end": ends if everywhere else np.where(mask, ends, None),
     }
-    infos.update({f"_{name}": mask for name in list(infos)})
-    ends = values[kernels.END]
-    ended = ends != kernels.RUNNING
-    if ended.any():
-        infos["end"] = np.where(ended, END_NAMES[ends.astype(np.int64)], None)
-        infos["_end"] = ended
+    for masked in MASKS:
+        infos[masked] = mask
     return infos
 
 
@@ -154,7 +193,7 @@ def final_infos(records: Array, observations: Array, ended: Array) -> Infos:
 
 
 def single_info(record: Array) -> Infos:
-    """Return the info of one episode, without its end, as `PathTrackingEnv` gives it."""
+    """Return the info of one episode, as `PathTrackingEnv` gives it."""
     values = record.tolist()
     return {
         "lateral_error": values[kernels.LATERAL_ERROR],
@@ -162,6 +201,7 @@ def single_info(record: Array) -> Infos:
         "speed_error": values[kernels.SPEED_ERROR],
         "arc_length": values[kernels.ARC_LENGTH],
         "state": record[:6].copy(),
-        "reward_terms": dict(zip(TERMS, values[kernels.TERMS :], strict=True)),
         "clipped": int(values[kernels.CLIPPED]),
+        **dict(zip(REWARD_KEYS, values[kernels.TERMS :], strict=True)),
+        "end": ENDS[int(values[kernels.END])],
     }

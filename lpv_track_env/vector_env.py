@@ -67,9 +67,8 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
 
     ## Infos
 
-    Those of the single environment as arrays over environments, `reward_terms` as a dictionary of
-    arrays; each `key` has a mask `_key` of the environments that it is valid for (the masks of one
-    call may be the same array). `end` is there only in steps in which an episode ended.
+    Those of the single environment as arrays over environments; each `key` has a mask `_key` of the
+    environments that it is valid for (the masks of one call may be the same array).
 
     ## Errors
 
@@ -228,7 +227,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
         return self.arrays.records
 
     def info_of(self, index: int) -> Infos:
-        """Return the info of environment `index`, as in a single environment, without its end."""
+        """Return the info of environment `index`, as in a single environment."""
         info = single_info(self.records[index])
         if self.condition_arrays is not None:
             info.update(layout.info_of(self.condition_arrays.vehicles[index]))
@@ -237,7 +236,7 @@ class PathTrackingVectorEnv(VectorEnv[Array, Array, Array]):
     def final_of(self, index: int) -> tuple[Infos, Array]:
         """Return the last info and observation of environment `index`, just ended in SAME_STEP."""
         record = self._step.final_records[index]
-        info = {**single_info(record), "end": kernels.END_NAMES[int(record[kernels.END])]}
+        info = single_info(record)
         if self.condition_arrays is not None:
             info.update(layout.info_of(self._step.final_vehicles[index]))
         return info, self._step.final_observations[index].copy()

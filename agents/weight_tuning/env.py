@@ -22,7 +22,7 @@ from agents.weight_tuning.score import FAILED, failed, marginal_parts, parts_of,
 from agents.weights import in_words
 from lpv_track_env import kernels as k
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
-from lpv_track_env.episodes import END_NAMES
+from lpv_track_env.episodes import ENDS
 from lpv_track_env.validation import checked_mask, checked_mode, forwards_arguments
 from lpv_track_env.vector_env import PathTrackingVectorEnv
 from trajectories.arguments import instance_of
@@ -80,7 +80,7 @@ class WeightTuningEnv(gymnasium.Env[NDArray[np.float32], Any]):
 
     `parts` (5,) of the window's score; its `steps`, `solves` and `failures`; the `band` of the next
     action; `weights` (12,) in use, zeros before the first window; the numbers of `rejected` and
-    `clipped` actions in the episode; and where it ended, its `end` and `score`.
+    `clipped` actions in the episode; its `end` ("" until then) and `score` (0 until then).
 
     ## Arguments
 
@@ -310,8 +310,10 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
     def _infos(self, mask: Array, tally: Tally | None = None, ended: Array | None = None) -> Infos:
         """Return a window's infos for the environments that `mask` (n,) marks, else zeros.
 
-        Environments that `ended` (n,) marks have an `end` and a `score`, too.
+        `ended` (n,) marks those whose episode this window ended.
         """
+        ended = np.zeros_like(mask) if ended is None else ended
+        ends = np.where(ended, self.drives.arrays.ends, k.RUNNING)
         memory = self.loop.memory
         driven = Tally(*np.zeros_like(self._sums)) if tally is None else tally
         infos: Infos = {
@@ -323,13 +325,12 @@ class WeightTuningVectorEnv(VectorEnv[Array, Array, Array]):
             "weights": np.where(mask[:, None], memory.nmpc.weights, 0.0),
             "rejected": np.where(mask, self._rejected, 0),
             "clipped": np.where(mask, self._clipped, 0),
+            "end": np.where(mask, ENDS[ends], np.array(None)),
+            "score": np.zeros(self.num_envs),
         }
+        if ended.any():
+            infos["score"][ended] = scores_of(Tally(*self._sums), ends)[ended]
         infos.update({f"_{name}": mask for name in list(infos)})
-        if ended is not None and ended.any():
-            ends = self.drives.arrays.ends
-            infos["end"] = np.where(ended, END_NAMES[ends], np.array(None))
-            infos["score"] = np.where(ended, scores_of(Tally(*self._sums), ends), 0.0)
-            infos["_end"] = infos["_score"] = ended
         return infos
 
     def _final(self, ended: Array, tally: Tally) -> Infos:

@@ -77,7 +77,7 @@ class WeightLearnerVecEnv(AdapterVecEnv):
                 "terminal_observation": infos["final_obs"][i] * self.feature_mask,
                 "TimeLimit.truncated": bool(truncated[i]),
                 "score": float(infos["final_info"]["score"][i]),
-                "end": str(infos["final_info"]["end"][i]),
+                "end": infos["final_info"]["end"][i],
             }
         return observations * self.feature_mask, rewards.astype(np.float32), done, last
 

@@ -108,7 +108,7 @@ class Vehicle:
     @property
     def end(self) -> str | None:
         """Why the drive ends: finished, left_corridor, wrong_heading or non_finite; else None."""
-        if "end" in self.info:
+        if self.info["end"]:
             return str(self.info["end"])
         return "left_corridor" if abs(self.info["lateral_error"]) > CORRIDOR else None
 
@@ -127,7 +127,7 @@ class Vehicle:
     def advance(self, until: float) -> None:
         """Advance by all steps that begin before `until` (s), braking if the command is stale."""
         steps = math.ceil(until * MS_PER_SECOND - 1e-6)
-        while self._steps < steps and "end" not in self.info:
+        while self._steps < steps and not self.info["end"]:
             if self.age > self._stale_after - 0.5 * STEP:
                 if self.braking is None:
                     self.braking = StaleBraking(self.time, self.age)
@@ -163,7 +163,7 @@ class Vehicle:
         self._command[1] = self.in_force[1]
         while (
             self.speed > STANDSTILL
-            and "end" not in self.info
+            and not self.info["end"]
             and self._steps - began < LONGEST_STOP * MS_PER_SECOND
         ):
             self._command[0] = stopping_acceleration(self.env.vehicle, self.speed)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lpv_track_env import kernels
 from lpv_track_env.bicycle import VX
 from lpv_track_env.env import RESET_OPTIONS, PathTrackingEnv
+from lpv_track_env.episodes import End
 from lpv_track_env.highway import scenes
 from lpv_track_env.highway.cruise import CruiseControl
 from lpv_track_env.highway.traffic import EgoVehicle, TrafficReference, others_on
@@ -83,7 +84,7 @@ class HighwayTrackEnv(PathTrackingEnv):
     ## Info
 
     In addition to path tracking's: `gap` (m to the bumper of the vehicle ahead, inf if there is
-    none), `leader_speed` (m/s along the path, NaN if there is none), `lane_error` (m, offset from
+    none), `leader_speed` (m/s along the path, inf if there is none), `lane_error` (m, offset from
     the centre of highway-env's own lane, positive to the path's left), `collision` (bool).
 
     ## Arguments
@@ -249,9 +250,9 @@ class HighwayTrackEnv(PathTrackingEnv):
         if self._ego.crashed:
             if not terminated:
                 loss = -self.task.reward_weights.end
-                info["reward_terms"]["end"] += loss
+                info["reward_end"] += loss
                 reward += loss
-            info["end"] = kernels.END_NAMES[kernels.COLLISION]
+            info["end"] = End.COLLISION
             self._record[kernels.END] = kernels.COLLISION
             terminated, truncated, self._running = True, False, False
         self._follow_traffic()

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 PREDICTION_TIMES = (0.75, 1.5, 2.25, 3.0)
 """Times, s, at which the positions of vehicles that follow their lanes are predicted."""
-NOBODY = Leader(math.inf, math.nan)
+NOBODY = Leader(math.inf, math.inf)
 """Stands for a free road."""
 STEP = 0.05
 """Step of a cruise control's profile, s."""

@@ -74,6 +74,15 @@ def vehicle_of(env: AbstractEnv) -> VehicleParameters:
     )
 
 
+def flat(info: dict[str, Any]) -> dict[str, Any]:
+    """Return an info of highway-env without its dictionary `rewards`: one entry for each term."""
+    terms = {
+        f"reward_{name.removesuffix('_reward')}": float(value)
+        for name, value in info.get("rewards", {}).items()
+    }
+    return {key: value for key, value in info.items() if key != "rewards"} | terms
+
+
 class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Environment of highway-env with the observation and action of this project's agents.
 
@@ -93,8 +102,9 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
     `policy_frequency` of 10 or more. If the environment's action has no throttle, the reference has
     the vehicle's speed, and no gap is kept.
 
-    In addition to highway-env's, infos contain `lateral_error`, `heading_error`, `speed_error`,
-    `arc_length` and `state` as in path tracking, and `gap`.
+    In addition to highway-env's, with its `rewards` as `reward_collision` and so on, infos contain
+    `lateral_error`, `heading_error`, `speed_error`, `arc_length` and `state` as in path tracking,
+    and `gap`.
 
     Parameters
     ----------
@@ -202,7 +212,7 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._begin()
         observation = self._observe(0.0)
         self._follow_traffic()
-        return observation, {**info, **self._info()}
+        return observation, {**flat(info), **self._info()}
 
     def step(
         self, action: NDArray[np.float32]
@@ -220,4 +230,5 @@ class HighwayTracking(gymnasium.Wrapper[Any, Any, Any, Any]):
         _, reward, terminated, truncated, info = self.env.step(given)
         observation = self._observe(ahead)
         self._follow_traffic()
-        return observation, reward, bool(terminated), bool(truncated), {**info, **self._info()}
+        info = {**flat(info), **self._info()}
+        return observation, reward, bool(terminated), bool(truncated), info

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 import trajectories
 from lpv_track_env import HIGHWAY_TRACK, PATH_TRACKING, WEIGHT_TUNING, kernels, vehicle
 from lpv_track_env.env import PathTrackingEnv
+from lpv_track_env.episodes import REWARD_KEYS
 from lpv_track_env.highway.env import HighwayTrackEnv
 from lpv_track_env.reward import TERMS, RewardWeights
 from lpv_track_env.vector_env import PathTrackingVectorEnv
@@ -362,29 +363,28 @@ def test_a_readonly_action_is_taken_and_left_alone() -> None:
 def test_info_holds_plain_python_values_and_the_state() -> None:
     env = make(trajectory="u-turn")
     _, first = env.reset(seed=0)
-    assert set(first["reward_terms"].values()) == {0.0}
+    assert {first[key] for key in REWARD_KEYS} == {0.0}
     _, reward, terminated, truncated, info = env.step(np.array([0.4, 0.3], dtype=np.float32))
     for said in (first, info):
         assert type(said) is dict
         assert list(said) == [
-            "lateral_error", "heading_error", "speed_error", "arc_length", "state",
-            "reward_terms", "clipped",
+            "lateral_error", "heading_error", "speed_error", "arc_length", "state", "clipped",
+            *(f"reward_{name}" for name in TERMS), "end",
         ]  # fmt: skip
-        state, terms, clipped = said["state"], said["reward_terms"], said["clipped"]
+        state, clipped = said["state"], said["clipped"]
         assert isinstance(state, np.ndarray)
         assert (state.shape, state.dtype) == ((6,), np.float64)
         assert state.base is None
-        assert type(terms) is dict
-        assert {type(value) for value in terms.values()} == {float}
+        assert {type(said[key]) for key in REWARD_KEYS} == {float}
         assert type(clipped) is int
+        assert said["end"] == ""
         assert {type(said[name]) for name in list(said)[:4]} == {float}
     assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
     record = env._record
     for name in ("lateral_error", "heading_error", "speed_error", "arc_length", "clipped"):
         assert info[name] == record[getattr(kernels, name.upper())]
     assert info["clipped"] == kernels.RATE_STEERING
-    assert list(info["reward_terms"].values()) == record[kernels.TERMS :][: len(TERMS)].tolist()
-    assert tuple(info["reward_terms"]) == TERMS
+    assert [info[key] for key in REWARD_KEYS] == record[kernels.TERMS :][: len(TERMS)].tolist()
     assert reward == record[kernels.REWARD]
     np.testing.assert_array_equal(info["state"], record[:6])
 
@@ -496,12 +496,12 @@ def test_hopeless_start_ends_with_a_reason(
     env = make(trajectory=trajectory)
     observation, info = env.reset(seed=0, options=options)
     assert env.observation_space.contains(observation)
-    assert "end" not in info
+    assert info["end"] == ""
     observation, reward, terminated, truncated, info = env.step(np.zeros(2, dtype=np.float32))
     assert env.observation_space.contains(observation)
     assert math.isfinite(reward)
     assert (terminated, truncated, info["end"]) == (True, False, end)
-    assert info["reward_terms"]["end"] == -20.0
+    assert info["reward_end"] == -20.0
 
 
 @pytest.mark.parametrize("speed", [0.0, -5.0, 40.0, 1e-9])
@@ -535,8 +535,8 @@ def test_path_is_finished() -> None:
     steps = episode(make(trajectory="u-turn"))
     assert steps[-1][2:4] == (True, False)
     assert steps[-1][4]["end"] == "finished"
-    assert steps[-1][4]["reward_terms"]["end"] == 0.0
-    assert all("end" not in info for *_, info in steps[:-1])
+    assert steps[-1][4]["reward_end"] == 0.0
+    assert all(info["end"] == "" for *_, info in steps[:-1])
     assert not any(terminated or truncated for _, _, terminated, truncated, _ in steps[:-1])
 
 
@@ -546,7 +546,7 @@ def test_time_limit_truncates() -> None:
     assert len(steps) == 10
     assert steps[-1][2:4] == (False, True)
     assert steps[-1][4]["end"] == "time_limit"
-    assert steps[-1][4]["reward_terms"]["end"] == 0.0
+    assert steps[-1][4]["reward_end"] == 0.0
 
 
 def test_default_time_limit_is_half_as_much_again() -> None:
@@ -976,10 +976,10 @@ def test_reward_terms_are_the_documented_formulas() -> None:
                                       + ((new_delta - delta) / h / 0.6) ** 2),
             "end": -9.0 if terminated else 0.0,
         }  # fmt: skip
-        assert tuple(info["reward_terms"]) == TERMS
+        assert tuple(wanted) == TERMS
         for name, value in wanted.items():
-            assert info["reward_terms"][name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
-        assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-12)
+            assert info[f"reward_{name}"] == pytest.approx(value, rel=1e-9, abs=1e-12), name
+        assert reward == pytest.approx(sum(info[key] for key in REWARD_KEYS), rel=1e-12)
         before, a, delta = info["arc_length"], float(new_a), float(new_delta)
     assert info["end"] == "left_corridor"
 

@@ -223,7 +223,7 @@ def test_a_collision_ends_the_episode_and_is_paid_for() -> None:
     info = go_on(env, agent, observation)[-1]
     assert info["end"] == "collision"
     assert info["collision"]
-    assert info["reward_terms"]["end"] == -env.task.reward_weights.end
+    assert info["reward_end"] == -env.task.reward_weights.end
     # Bumper to bumper, to the way of a period.
     assert -0.6 < info["gap"] < 0.1
     with pytest.raises(gymnasium.error.ResetNeeded):
