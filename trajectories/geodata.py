@@ -257,15 +257,15 @@ def read_geojson(file: Path, part: str | None = None) -> RawPath:
 def _geometries(value: Any) -> Iterator[tuple[str, Any]]:
     """Yield LineString, Polygon (its rings) and Point geometries, and their coordinates."""
     kind = value.get("type") if isinstance(value, dict) else None
-    if kind in {"FeatureCollection", "GeometryCollection"}:
+    if kind in ("FeatureCollection", "GeometryCollection"):
         members = value.get("features" if kind[0] == "F" else "geometries")
         for member in members if isinstance(members, list) else []:
             yield from _geometries(member)
     elif kind == "Feature":
         yield from _geometries(value.get("geometry"))
-    elif kind in {"LineString", "Point"}:
+    elif kind in ("LineString", "Point"):
         yield kind, value.get("coordinates")
-    elif kind in {"MultiLineString", "Polygon", "MultiPoint"}:
+    elif kind in ("MultiLineString", "Polygon", "MultiPoint"):
         coordinates = value.get("coordinates")
         for one in coordinates if isinstance(coordinates, list) else []:
             yield kind.removeprefix("Multi"), one

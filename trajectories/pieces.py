@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from trajectories.arguments import shortened, shown
 from trajectories.raw_path import RawPath
+from trajectories.text_table import MOST_ROWS
 
 Array = NDArray[np.float64]
 
@@ -87,9 +88,12 @@ class Pieces:
         """
         taken = self.longest if part is None else part
         steps = [step.strip() for step in taken.split(",")]
-        with np.errstate(over="ignore", invalid="ignore"):
-            pieces = [self._step(step) for step in steps]
-        for step, piece in zip(steps, pieces, strict=True):
+        pieces, points = [], 0
+        for step in steps:
+            pieces.append(piece := self._step(step))
+            points += len(piece.places)
+            if points > MOST_ROWS:
+                self.fail(f"more than {MOST_ROWS} points are not read")
             if not all(np.isfinite(values).all() for values in piece.columns.values()):
                 self.fail(f"{self.noun} {shortened(step, 40)} has numbers that are too large")
         joined = pieces[0] if len(pieces) == 1 else self._joined(steps, pieces)

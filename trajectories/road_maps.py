@@ -80,6 +80,7 @@ class _Map:
 # --- OpenDRIVE ---
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused
 def read_opendrive(file: Path, part: str | None = None) -> RawPath:
     """Read the reference line of a road, by default the longest, or the centre of a lane.
 
@@ -299,6 +300,7 @@ def _cubic(
 # --- CommonRoad ---
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def read_commonroad(file: Path, part: str | None = None) -> RawPath:
     """Read centre lines of lanelets, by default those of the longest chain of successors.
 
@@ -340,6 +342,8 @@ def _centre(found: _Map, lanelet: Element, what: str) -> Piece:
     left, right = bounds
     centre, half = 0.5 * (left + right), 0.5 * np.hypot(*(left - right).T)
     lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(centre, axis=0).T))])
+    if not LENGTHS.holds(float(lengths[-1])):
+        raise found.refuse(f"{what} is {lengths[-1]:.4g} m long, at most {LENGTHS.high:g} are read")
     at = _subdivided(lengths)
     x, y, width = (np.interp(at, lengths, values) for values in (*centre.T, half))
     columns = {"x": x, "y": y, "width_left": width, "width_right": width}
@@ -366,7 +370,7 @@ def _subdivided(lengths: Array) -> Array:
         return lengths
     most = float(np.clip(5.0 * np.median(steps), 1.0, LONGEST_LANELET_STEP))
     most = min(most, lengths[-1] / 3.0)  # four points at least
-    counts = np.maximum(np.ceil(np.minimum(steps, LENGTHS.high) / most).astype(int), 1)
+    counts = np.maximum(np.ceil(steps / most).astype(int), 1)
     pieces = [
         np.linspace(start, stop, count, endpoint=False)
         for start, stop, count in zip(lengths[:-1], lengths[1:], counts, strict=True)
@@ -380,17 +384,18 @@ def _longest_chain(lanelets: dict[str, Element], read: Callable[[str], Piece]) -
     Depth first from the lanelets without predecessors; a successor that is its own ancestor ends
     a chain, so in a roundabout the chain need not be the longest one.
     """
-    centres = {name: read(name) for name in lanelets}
-    length = {
-        name: float(np.hypot(np.diff(one.columns["x"]), np.diff(one.columns["y"])).sum())
-        for name, one in centres.items()
-    }
+    ends: dict[str, tuple[Array, Array]] = {}
+    length: dict[str, float] = {}
+    for name in lanelets:
+        one = read(name)
+        ends[name] = one.end(0), one.end(-1)
+        length[name] = float(np.hypot(np.diff(one.columns["x"]), np.diff(one.columns["y"])).sum())
     following = {
         name: [
             other
             for link in lanelet.iterfind("successor")
             if (other := link.get("ref", "")) in lanelets
-            and math.dist(centres[name].end(-1), centres[other].end(0)) <= MEETS
+            and math.dist(ends[name][1], ends[other][0]) <= MEETS
         ]
         for name, lanelet in lanelets.items()
     }

@@ -2,10 +2,13 @@
 
 import json
 import math
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.special import ellipeinc
 
 from trajectories import load
@@ -316,6 +319,7 @@ def test_geojson_geometries(tmp_path: Path) -> None:
         ({"points": [[0, 0]]}, r"is JSON but no GeoJSON \(it has no type\)"),
         ([[0, 0], [1, 1]], r"is JSON but no GeoJSON \(it has no type\)"),
         ({"type": "Polyline"}, "its type is 'Polyline'"),
+        ({"type": ["LineString"], "coordinates": []}, r"its type is \['LineString'\]"),
         ({"type": "LineString", "coordinates": 3}, "coordinates of a LineString are not a list"),
         ({"type": "LineString", "coordinates": [[1.0]]}, "is not longitude, latitude"),
         ({"type": "LineString", "coordinates": [[True, 1], [2, 2]]}, "point 1: True is not a"),
@@ -452,3 +456,30 @@ def test_xml_is_bounded(
 def test_an_unknown_encoding_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"x\.gpx: .*encoding"):
         read(tmp_path / "x.gpx", '<?xml version="1.0" encoding="klingon"?><gpx></gpx>')
+
+
+@pytest.mark.parametrize("kind", ["gpx", "kml", "geojson", "nmea"])
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_damaged_files_are_read_or_refused_in_one_line(kind: str, data: st.DataObject) -> None:
+    text = lap_of(kind)[:1500]
+    for _ in range(data.draw(st.integers(1, 3))):
+        start = data.draw(st.integers(0, len(text)))
+        stop = data.draw(st.integers(start, min(start + 30, len(text))))
+        inner = data.draw(
+            st.sampled_from(["", "nan", "1e999", "[", "}", "<", "-->", ",", "S", "\0"])
+        )
+        text = text[:start] + inner + text[stop:]
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"x.{kind}"
+        file.write_text(text)
+        message = f"{file}: "
+        try:
+            reader = reader_of(file, text.encode())
+            if reader is not None:
+                raw = reader(file, None)
+                assert {len(values) for values in raw.columns.values()} == {len(raw.places)}
+        except ValueError as error:
+            message = str(error)
+    assert message.startswith(f"{file}: ")
+    assert message.isprintable()

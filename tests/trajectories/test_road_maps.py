@@ -356,6 +356,7 @@ def test_a_chain_of_thousands_needs_no_recursion(tmp_path: Path) -> None:
             scenario('<lanelet id="1"><leftBound><point><x>a</x></point></leftBound></lanelet>'),
             "lanelet 1: x of its leftBound: 'a' is not a finite number",
         ),
+        (scenario(straight(1, -1e308, 1e308)), "lanelet 1 is inf m long, at most 30000 are read"),
     ],
 )
 def test_flaws_of_lanelets_are_named(text: str, message: str, tmp_path: Path) -> None:
