@@ -151,6 +151,7 @@ class _Points:
         metadata: dict[str, str] = {}
         if "latitude longitude" in self:
             kind = "GPS log"
+            metadata |= self._drop_rows_without_fix()
             columns = {q: self.read(q) for q in ("latitude", "longitude")}
             if "height" in self:
                 columns["height"] = self.read("height")
@@ -176,6 +177,17 @@ class _Points:
         places = [f"line {line}" for line in self.table.lines]
         file = self.table.file
         return RawPath(kind, str(file), file.stem, columns, places, metadata=metadata)
+
+    def _drop_rows_without_fix(self) -> dict[str, str]:
+        """Leave out rows without latitude and longitude, and return words that say so."""
+        table, places = self.table, [self.found[q][1] for q in ("latitude", "longitude")]
+        fixed = [k for k, row in enumerate(table.rows) if any(row[place] for place in places)]
+        if (count := len(table.rows) - len(fixed)) == 0:
+            return {}
+        rows, lines = ([values[k] for k in fixed] for values in (table.rows, table.lines))
+        self.table = replace(table, rows=rows, lines=lines)
+        self.table.check_size()
+        return {"missing": f"{count} rows without a position left out"}
 
     def _fail(self) -> None:
         """Raise a ValueError that says which columns are missing."""

@@ -70,10 +70,11 @@ def read_lines(file: str | Path) -> list[str]:
 def read_table(file: str | Path, known: Callable[[str], object]) -> TextTable:
     """Split a text file at `;`, `,`, tabs or blanks; commas are decimal ones unless they separate.
 
-    The first line with two numbers is the first row. A header is a line before it, a comment (`#`,
-    `%`) or not, with as many cells: the last one of which two names, in lower case, are `known`, or
-    else the last one that is no comment. Units may stand in a line of their own below it. A cell
-    that is empty in every row and beyond the header, after a last separator, is left out.
+    The first row is the first line with two numbers, or with one below known names. A header is a
+    line before it, a comment (`#`, `%`) or not, with as many cells: the last one of which two
+    names, in lower case, are `known`, or else the last one that is no comment. Units may stand in a
+    line of their own below it. A cell that is empty in every row and beyond the header, after a
+    last separator, is left out.
 
     Raises
     ------
@@ -85,19 +86,20 @@ def read_table(file: str | Path, known: Callable[[str], object]) -> TextTable:
     rows: list[list[str]] = []
     lines: list[int] = []
     separator: str | None = None
+    least = 2
     for number, line in enumerate(read_lines(file), start=1):
-        text = line.strip()
-        if not text or text[0] in "#%":
-            if text and not rows:
-                heads.append(text)
+        text = line.strip(" ")
+        if not text.strip() or (rows and text[0] in "#%"):
             continue
         if not rows:
             separator = _separator(text)
-        cells = _split(text, separator)
-        if not rows and sum(is_number(cell, separator) for cell in cells) < 2:
-            heads.append(text)
-            continue
-        rows.append(cells)
+            numbers = sum(is_number(cell, separator) for cell in _split(text, separator))
+            if numbers < least or text[0] in "#%":
+                heads.append(text)
+                if any(_are_names(_names(text, sign), known) for sign in SEPARATORS):
+                    least = 1
+                continue
+        rows.append(_split(text, separator))
         lines.append(number)
         if len(rows) > MOST_ROWS:
             break
@@ -126,13 +128,21 @@ def _header(
     for text in reversed(heads):
         comment = text[0] in "#%"
         for sign in (separator, *SEPARATORS):
-            names = tuple(cell.lower() for cell in _split(text.lstrip("#% \t"), sign))
+            names = _names(text, sign)
             fits = len(names) == width
-            if (fits or not comment) and sum(known(name) is not None for name in names) >= 2:
+            if (fits or not comment) and _are_names(names, known):
                 return names if len(names) != width else tuple(map(_with_unit, names, units))
             if fits and not header and not comment:
                 header = units = names
     return header
+
+
+def _names(text: str, separator: str | None) -> tuple[str, ...]:
+    return tuple(cell.lower() for cell in _split(text.lstrip("#% "), separator))
+
+
+def _are_names(cells: Sequence[str], known: Callable[[str], object]) -> bool:
+    return sum(known(cell) is not None for cell in cells) >= 2
 
 
 def _with_unit(name: str, unit: str) -> str:

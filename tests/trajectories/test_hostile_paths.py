@@ -15,6 +15,7 @@ import trajectories
 from trajectories import (
     ReferencePath,
     SpeedLimits,
+    cleaning,
     importers,
     plan_speed,
     random_path,
@@ -92,7 +93,7 @@ def test_a_duplicate_in_the_last_of_many_rows_is_named_at_once() -> None:
     raw = RawPath("x,y", "long.csv", "long", columns, [f"line {k}" for k in range(1, n + 2)])
     began = time.perf_counter()
     with pytest.warns(UserWarning, match=rf"1 duplicates .*first: line {n + 1}\b"):
-        assert len(importers._Import(raw, USUAL)._thinned()[0].places) == n
+        assert len(cleaning._thinned(raw, USUAL, cleaning.Findings("long.csv"))[0].places) == n
     assert time.perf_counter() - began < 20.0  # it took hours when it was quadratic
 
 

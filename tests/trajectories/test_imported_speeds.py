@@ -323,7 +323,7 @@ def test_an_array_of_waypoints_makes_a_path() -> None:
         (np.zeros((9, 2)), {}, "array: 1 distinct points, at least 4"),
         ([[0, 0], [1, math.nan]], {}, r"points\[1\] is .* must be finite"),
         (np.column_stack([X, X]), {"speed": [1.0]}, r"speed must be of shape \(101,\), not \(1,\)"),
-        (np.column_stack([X, X]), {"speed": -X}, "array: point 100: speed -100 m/s is negative"),
+        (np.column_stack([X, X]), {"speed": -X}, "array: point 1: speed -1 m/s is not"),
         (np.column_stack([X, X]), {"widths": X}, r"widths must be of shape \(101, 2\)"),
         (np.column_stack([X, X]), {"lapse": X}, "unknown option of from_waypoints 'lapse'"),
         (np.column_stack([X, X])[[0, 5, 2, 3, 4]], {}, "turns back by 180 degrees at point 1 "),

@@ -54,6 +54,7 @@ def is_ellipse(path: ReferencePath) -> bool:
         "utm_e,utm_n\n" + rows(),
         "field.pose.pose.position.x,field.pose.pose.position.y\n" + rows(),
         "/odom/pose/pose/position/x,/odom/pose/pose/position/y\n" + rows(),
+        "\tx\ty\n" + "".join(f"{k}\t{x}\t{y}\n" for k, (x, y) in enumerate(ELLIPSE)),  # pandas
         rows().replace("\n", "\r\n"),
         "\ufeff" + rows(),
     ],
@@ -153,9 +154,13 @@ def test_columns_are_named_by_the_user(tmp_path: Path) -> None:
             "x,y,v\n" + rows(math.nan).replace("nan", "fast"),
             "line 2, column v: 'fast' is not a number",
         ),
-        ("x,y,v\n" + rows(-1.0), "line 2: speed -1 m/s is negative"),
+        ("x,y,v\n" + rows(-1.0), "line 2: speed -1 m/s is not from 0 to 200; speeds='planned'"),
         ("x,y,v (furlongs)\n" + rows(3.0), r"name 'v \(furlongs\)' is none of m/s, mps"),
         ("x (ell),y (ell)\n" + rows(), r"name 'x \(ell\)' is none of m, km, cm, mm"),
+        ("x;y\n1.060,00;1,5\n" + rows(separator=";"), "line 2 has 3 columns, not 2"),
+        ("x;y\n1.060,00;1\n" + rows(separator=";"), "line 2, .* '1.060,00' is not a number"),
+        ("t,x,y\n0,,\n" + rows(1.0), "line 2, column x: '' is not a number"),
+        ("t,lat,lon\n0,,\n1,48,\n", "line 3, column lon: '' is not a number"),
         ("x,y,v\n" + rows(), "line 2 has 2 columns, not 3"),
         ('"x,y\n' * 3, "no rows of numbers"),
     ],
@@ -222,3 +227,11 @@ def test_times_of_day_are_times(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="if they are in km/h"):
         path = load(file)
     assert path.speed.max() == pytest.approx(14.4, rel=1e-6)
+
+
+def test_rows_before_the_first_fix_are_left_out(tmp_path: Path) -> None:
+    degrees = np.column_stack([48.0 + ELLIPSE[:, 1] / 111_200.0, 11.0 + ELLIPSE[:, 0] / 74_600.0])
+    lines = "".join(f"{k},{a:.8f},{o:.8f}\n" for k, (a, o) in enumerate(degrees.tolist()))
+    path = load(written(tmp_path, "t,lat,lon\n-2,,\n-1,,\n" + lines))
+    assert path.closed
+    assert "; 2 rows without a position left out; " in path.metadata["imported"]
