@@ -184,8 +184,9 @@ class _Points:
         fixed = [k for k, row in enumerate(table.rows) if any(row[place] for place in places)]
         if (count := len(table.rows) - len(fixed)) == 0:
             return {}
-        rows, lines = ([values[k] for k in fixed] for values in (table.rows, table.lines))
-        self.table = replace(table, rows=rows, lines=lines)
+        self.table = replace(
+            table, rows=[table.rows[k] for k in fixed], lines=[table.lines[k] for k in fixed]
+        )
         self.table.check_size()
         return {"missing": f"{count} rows without a position left out"}
 
