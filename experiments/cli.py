@@ -6,6 +6,7 @@ import io
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -123,7 +124,7 @@ def run(options: argparse.Namespace) -> int:
     # Piped output keeps the tables' width; a terminal, or COLUMNS, has its own.
     wide = None if sys.stdout.isatty() or "COLUMNS" in os.environ else 120
     console = Console(width=wide)
-    with _imports_said(console):
+    with _imports_said(console), _warnings_in_lines():
         code: int = module_of(options.command).run(options, console)
     return code
 
@@ -151,6 +152,25 @@ def _imports_said(console: "Console") -> Iterator[None]:
     finally:
         log.removeFilter(once)
         log.setLevel(level)
+
+
+@contextmanager
+def _warnings_in_lines() -> Iterator[None]:
+    """Print a user's warnings as lines, each once; others keep their place in the sources."""
+    said: set[str] = set()
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        line = f"lpv-track: warning: {message}"
+        if category is not UserWarning:
+            usual(message, category, *place, **more)
+        elif line not in said:
+            said.add(line)
+            print(line, file=sys.stderr)
+
+    usual = warnings.showwarning
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

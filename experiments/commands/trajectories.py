@@ -1,6 +1,7 @@
 """`lpv-track trajectories`: published against achieved rows of paths, drawn and written."""
 
 import argparse
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,11 +84,15 @@ def run(options: argparse.Namespace, console: Console) -> int:
     """Print the table of the paths, draw and write them as asked, and return 0."""
     import trajectories
     from experiments.run.suites import RAW, SIX
+    from lpv_track_env.reference import too_sharp_bend
     from trajectories.speed import replanned
 
     names = options.names or [*SIX, *RAW]
     given = import_options(options, names)
     paths = [trajectories.load(name, **given) for name in names]
+    for path in paths if "vehicle" in given else []:
+        if bend := too_sharp_bend(path, given["vehicle"]):
+            warnings.warn(bend, UserWarning, stacklevel=2)
     if options.section is not None:
         paths = [path.section(*options.section) for path in paths]
     if options.plan:
