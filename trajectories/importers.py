@@ -22,8 +22,8 @@ from trajectories.naming import choose
 from trajectories.oddities import oddities
 from trajectories.path import MINIMUM_SPEED, ReferencePath
 from trajectories.raw_path import RawPath
-from trajectories.shapes import Smoothed, from_geometry, smooth
-from trajectories.speed import keep_speed
+from trajectories.shapes import Smoothed, smooth
+from trajectories.speed import keep_speed, plan_speed
 from trajectories.speed_limits import SpeedLimits
 
 Array = NDArray[np.float64]
@@ -183,7 +183,10 @@ def path_of(raw: RawPath, options: ImportOptions = USUAL) -> ReferencePath:
     smoothing = options.smoothing
     if smoothing is None:
         smoothing = GPS_SMOOTHING if geographic(raw) else SMOOTHING
-    smoothed = smooth(points_of(points), smoothing, closed=closed)
+    try:
+        smoothed = smooth(points_of(points), smoothing, closed=closed)
+    except ValueError as error:  # a spline that swings out to kilometres between few points
+        raw.fail(str(error))
     for oddity in oddities(smoothed.geometry, closed):
         findings.warn(oddity)
     speed = _speed(points, smoothed, closed, options, findings)
@@ -211,14 +214,15 @@ def path_of(raw: RawPath, options: ImportOptions = USUAL) -> ReferencePath:
         "imported": "; ".join([", ".join(said), *pieces, *findings.notes]),
     }
     LOG.info("%s: %s", raw.origin, metadata["imported"])
-    geometry, label = smoothed.geometry, raw.name if options.name is None else options.name
-    if speed is None:
-        try:
-            speed = from_geometry(geometry, limits, label, closed=closed).speed
-        except RuntimeError as error:  # no speed profile found
-            raw.fail(str(error))
+    geometry, spacing = smoothed.geometry, float(smoothed.geometry.arc_length[1])
+    label = raw.name if options.name is None else options.name
     widths = _widths(points, smoothed, options.scale)
-    return ReferencePath(*geometry[:5], speed, label, closed, metadata, widths)
+    try:
+        if speed is None:
+            speed = plan_speed(geometry.curvature, spacing, limits, closed=closed)
+        return ReferencePath(*geometry[:5], speed, label, closed, metadata, widths)
+    except (RuntimeError, ValueError) as error:  # no profile, or a curve that loops
+        raw.fail(str(error))
 
 
 def _widths(raw: RawPath, smoothed: Smoothed, scale: float) -> Array | None:

@@ -17,8 +17,9 @@ SECONDS = 20
 """Limit for an input."""
 MEGABYTES = 3000
 INSTRUMENTED = (
-    "trajectories.fileio", "trajectories.text_table", "trajectories.files",
-    "trajectories.importers", "trajectories.geodesy", "trajectories.path", "trajectories.catalog",
+    "trajectories.fileio", "trajectories.text_table", "trajectories.columns", "trajectories.files",
+    "trajectories.cleaning", "trajectories.importers", "trajectories.import_options",
+    "trajectories.geodesy", "trajectories.path", "trajectories.catalog",
     "lpv_track_env.plausibility", "lpv_track_env.vehicle", "agents.weights",
 )  # fmt: skip
 """Modules without compiled functions, whose bytecode may be changed."""
