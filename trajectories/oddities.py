@@ -40,7 +40,8 @@ def self_approach(geometry: Geometry, closed: bool) -> tuple[float, float, float
     None if no points that lie more than 20 m apart along the path (across the seam too if it is
     closed) are closer than 2.5 m.
     """
-    stride = 2  # 0.5 m: the nearest nodes are at most 0.35 m further apart than the branches
+    # 0.5 m: the nearest nodes are at most 0.35 m further apart than the branches
+    stride = max(round(0.5 / geometry.arc_length[1]), 1)
     s = geometry.arc_length[::stride]
     points = np.column_stack([geometry.x[::stride], geometry.y[::stride]])
     # A point's nearest neighbours, itself and those on its own branch included: one more than these

@@ -19,7 +19,8 @@ from experiments.ros.read import BagError, Reading, info, read
 from experiments.ros.topics import Datum, Fixes, GeoPoint, Odometry
 from trajectories.oddities import oddities
 from trajectories.path import ReferencePath
-from trajectories.shapes import Geometry, from_geometry, largest_penalty, smooth
+from trajectories.shapes import Geometry, from_geometry, smooth
+from trajectories.smoothing import largest_penalty
 from trajectories.speed import SpeedLimits
 
 Array = NDArray[np.float64]
