@@ -4,6 +4,7 @@ Folders and files that compile more than the environment's kernels, train, start
 are slow as a whole. In other files, slow tests are marked one by one.
 """
 
+import os
 import signal
 from pathlib import Path
 
@@ -27,6 +28,7 @@ SLOW = (
 
 
 def pytest_configure() -> None:
+    os.environ["LPV_TRACK_CACHE"] = "off"  # nothing of the tests is left in the user's cache
     # Whoever is started in the background ignores Ctrl-C, and so do the processes it starts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

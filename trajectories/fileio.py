@@ -175,8 +175,10 @@ def checked(value: object, kind: type[Value], name: object) -> Value:
         raise ValueError(f"{shortened(name)}: {shortened(error)}") from error
 
 
-def write_atomically(file: Path, content: bytes) -> None:
+def write_atomically(file: Path, content: bytes, *, durable: bool = True) -> None:
     """Replace a file: temporary file in the same folder (made if need be), fsync, rename.
+
+    Without `durable` there is no fsync: a crash of the system may leave a torn file.
 
     Raises
     ------
@@ -189,7 +191,8 @@ def write_atomically(file: Path, content: bytes) -> None:
         with temporary.open("wb") as handle:
             handle.write(content)
             handle.flush()
-            os.fsync(handle.fileno())
+            if durable:
+                os.fsync(handle.fileno())
         temporary.replace(file)
     finally:
         temporary.unlink(missing_ok=True)

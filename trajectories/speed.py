@@ -2,15 +2,18 @@
 
 from dataclasses import asdict, replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
+from trajectories import plan_cache, speed_limits, speed_program
 from trajectories.arguments import Number, array, instance_of
 from trajectories.path import MINIMUM_POINTS, MINIMUM_SPEED, ReferencePath
 from trajectories.speed_limits import SpeedLimits
-from trajectories.speed_program import plan, smoothed_at, without_jerk
+from trajectories.speed_program import plan, smoothed_at, smoothing_rows, without_jerk
 
 __all__ = [
     "GRAVITY", "SpeedLimits", "constant_speed", "keep_speed", "plan_speed", "replanned",
@@ -24,6 +27,10 @@ GRAVITY = 9.81
 GRID, COARSEST_GRID, FINE_CELLS = 1.0, 2.0, 3000
 """Largest spacing of the linear programmes' grid, m, and that of a path with more cells than
 these: their number stays, until their length is the second."""
+CELL_TURN = 0.25
+"""rad: largest turn in a cell of the grid, which small cars' bends need, up to `FINE_CELLS`."""
+ROUNDS, KEPT = 8, 1.005
+"""Largest number of plans for a path, and the excess over a limit that is not worth another."""
 STEERING_MARGIN = 0.96
 """Share of the steering rate that is used."""
 SPACINGS = Number(1e-3, 1e9, "m")
@@ -109,12 +116,24 @@ def _planned(
             max_deceleration=min(limits.deceleration, total),
         )
     kappa, shares = np.frombuffer(curvature), np.frombuffer(share)
-    caps = speed_caps(kappa, spacing, limits, shares, closed=closed)
-    length = spacing * (len(kappa) - 1)
+    content = (curvature, share, repr((spacing, limits, closed)).encode())
+    sources = (__file__, speed_limits.__file__, speed_program.__file__)
+    return plan_cache.computed(
+        sources, content, len(kappa), lambda: _plan(kappa, spacing, limits, closed, shares)
+    )
+
+
+def _plan(
+    curvature: Array, spacing: float, limits: SpeedLimits, closed: bool, share: Array
+) -> Array:
+    """Plan as `plan_speed`, again where the profile exceeds limits between the grid's nodes."""
+    caps = speed_caps(curvature, spacing, limits, share, closed=closed)
+    length, sharpest = spacing * (len(curvature) - 1), float(np.abs(curvature).max())
     grid = min(max(length / FINE_CELLS, GRID), COARSEST_GRID)
+    grid = min(grid, max(CELL_TURN / max(sharpest, 1e-9), length / FINE_CELLS, spacing))
     cells = max(int(np.ceil(length / grid)), 8)
     coarse = np.linspace(0.0, length, cells + 1)
-    fine = np.linspace(0.0, length, len(kappa))
+    fine = np.linspace(0.0, length, len(curvature))
     # The nodes of a lap: its last one is the first.
     lap = slice(-1 if closed else None)
     # A coarse node takes the lowest cap around it, so that no cap is lost between nodes.
@@ -124,14 +143,79 @@ def _planned(
         np.lib.stride_tricks.sliding_window_view(
             np.pad(values[lap], reach, mode="wrap" if closed else "edge"), 2 * reach + 1
         )[nodes]
-        for values in (caps, np.abs(kappa))
+        for values in (caps, np.abs(curvature))
     )
-    squared = plan(lowest.min(axis=1) ** 2, bent.max(axis=1), length / cells, limits, closed=closed)
-    smoothed = smoothed_at(squared, fine * (cells / length), closed=closed)
-    planned: Array = np.sqrt(np.minimum(smoothed, limits.max_speed**2))
-    if closed:
-        planned[-1] = planned[0]
-    return planned
+    upper, bent, eased = lowest.min(axis=1) ** 2, bent.max(axis=1), np.ones(len(nodes))
+    at = fine * (cells / length)
+    nearest = np.rint(at).astype(int) % len(nodes)
+    rows, bounds = sparse.csr_matrix((0, len(nodes))), np.empty(0)
+    best, least = np.empty(0), np.inf
+    for _ in range(ROUNDS):
+        try:
+            squared = plan(
+                upper, bent, eased, length / cells, limits, (rows, bounds), closed=closed
+            )
+        except RuntimeError:
+            if best.size:
+                break
+            raise
+        planned = np.sqrt(np.minimum(smoothed_at(squared, at, closed=closed), limits.max_speed**2))
+        if closed:
+            planned[-1] = planned[0]
+        over, jerked = _excess(planned, curvature, spacing, limits, share, closed=closed)
+        worst = max(over.max(), jerked.max())
+        if worst < least:
+            best, least = planned, worst
+        if worst <= KEPT:
+            break
+        beyond = np.flatnonzero(over > 1.0)
+        added = smoothing_rows(at[beyond], len(nodes), closed=closed)
+        rows = sparse.vstack([rows, added], format="csr")
+        bounds = np.append(bounds, planned[beyond] ** 2 / over[beyond])
+        harder = np.ones(len(nodes))
+        np.maximum.at(harder, nearest, jerked)
+        eased = eased / harder**1.5
+    return best
+
+
+def _excess(
+    speed: Array,
+    curvature: Array,
+    spacing: float,
+    limits: SpeedLimits,
+    share: Array,
+    *,
+    closed: bool,
+) -> tuple[Array, Array]:
+    """Measure a profile at the path's own nodes: shares of limits that are used, each (n,).
+
+    The first are of the squared speed and of all that grows with it: lateral acceleration, steering
+    rate, and both accelerations together, or of `min_speed` where that is more. The second are of
+    the jerk.
+    """
+    ends = slice(-2, -1) if closed else slice(1), slice(1, 2) if closed else slice(-1, None)
+    v, kappa = (np.concatenate([u[ends[0]], u, u[ends[1]]]) for u in (speed, curvature))
+    along, steering = np.diff(v**2) / (2.0 * spacing), np.arctan(limits.wheelbase * kappa)
+    in_cells = 0.5 * (v[1:] + v[:-1]) * np.abs(np.diff(steering)) / spacing
+    at_nodes = 0.5 * speed * np.abs(steering[2:] - steering[:-2]) / spacing
+    steered = np.maximum(at_nodes, _larger(in_cells)) / limits.max_steering_rate
+    lateral = speed**2 * np.abs(curvature)
+    over = np.maximum(lateral / (share * limits.max_lateral_acceleration), steered**2)
+    if (total := limits.max_total_acceleration) is not None:
+        over = np.maximum(over, np.hypot(_larger(np.abs(along)), lateral) / total)
+    for (x, y), (next_x, next_y) in pairwise(limits.corners or ()):
+        facing, across = y - next_y, next_x - x
+        used = _larger(facing * along) + across * lateral
+        over = np.maximum(over, used / (facing * x + across * y))
+    jerked = speed * np.abs(np.diff(along)) / (spacing * limits.max_jerk)
+    if not closed:
+        jerked[[0, -1]] = 0.0
+    return np.minimum(over, (speed / limits.min_speed) ** 2), jerked
+
+
+def _larger(cells: Array) -> Array:
+    """Return the larger of the values in the two cells beside each node."""
+    return np.maximum(cells[1:], cells[:-1])
 
 
 def keep_speed(

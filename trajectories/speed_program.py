@@ -45,14 +45,33 @@ def smoothed_at(values: Array, at: Array, *, closed: bool) -> Array:
         values = np.append(values, after)
         after = values[1]
     padded = np.concatenate([[before], values, [after]])
-    node = np.rint(at).astype(int).clip(0, len(values) - 1)
-    u = at - node
-    smoothed: Array = (
-        0.5 * (0.5 - u) ** 2 * padded[node]
-        + (0.75 - u * u) * padded[node + 1]
-        + 0.5 * (0.5 + u) ** 2 * padded[node + 2]
-    )
+    node, (before, here, after) = _spline(at, len(values))
+    smoothed: Array = before * padded[node] + here * padded[node + 1] + after * padded[node + 2]
     return smoothed
+
+
+def _spline(at: Array, count: int) -> tuple[NDArray[np.intp], tuple[Array, Array, Array]]:
+    """Return the nearest of so many nodes and the weights of it and its neighbours, each (n,)."""
+    node = np.rint(at).astype(int).clip(0, count - 1)
+    u = at - node
+    return node, (0.5 * (0.5 - u) ** 2, 0.75 - u * u, 0.5 * (0.5 + u) ** 2)
+
+
+def smoothing_rows(at: Array, count: int, *, closed: bool) -> sparse.csr_matrix:
+    """Return the matrix (n, count) of `smoothed_at` at indices (n,)."""
+    node, weights = _spline(at, count + closed)
+    rows = sparse.csr_matrix((len(at), count))
+    for shift, weight in zip((-1, 0, 1), weights, strict=True):
+        column = (node + shift) % count if closed else (node + shift).clip(0, count - 1)
+        outside = (node + shift != column) & (not closed)
+        inner = np.where(column == 0, 1, count - 2)
+        for entries, columns in (
+            (np.where(outside, 2.0, 1.0) * weight, column),
+            (np.where(outside, -weight, 0.0), inner),
+        ):
+            places = (np.arange(len(at)), columns)
+            rows += sparse.csr_matrix((entries, places), shape=rows.shape)
+    return rows
 
 
 class _Facet(NamedTuple):
@@ -110,10 +129,21 @@ def _within_region(
     return sparse.vstack(rows, format="csr"), np.concatenate(bounds)
 
 
-def plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: bool) -> Array:
+def plan(
+    caps: Array,
+    bent: Array,
+    eased: Array,
+    h: float,
+    limits: SpeedLimits,
+    between_nodes: tuple[sparse.csr_matrix, Array],
+    *,
+    closed: bool,
+) -> Array:
     """Plan the squared speed (m,) on a grid of spacing h under squared caps (m,).
 
-    `bent` is |curvature| (m,), 1/m. After the last node of a closed path comes the first again.
+    `bent` is |curvature| (m,), 1/m, and `eased` the share of the jerk to use (m,). Further bounds
+    on sums of squared speeds are `between_nodes`: rows (k, m) and bounds (k,). After the last node
+    of a closed path comes the first again.
     """
     m = len(caps)
     end = float(caps.min()) if closed else min(limits.end_speed**2, float(caps[0]), float(caps[-1]))
@@ -136,11 +166,12 @@ def plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: boo
     identity = sparse.identity(inner, format="csr")
     nothing = sparse.csr_matrix((cells, inner))
     region, most = _within_region(bent, caps, difference, limits)
+    region, most = sparse.vstack([region, between_nodes[0]]), np.append(most, between_nodes[1])
     fastest = np.inf
     for _ in range(ITERATIONS):
         last = np.maximum(squared, lower)[between]
         # j h b^(-1/2) linearised at b0: j h (1.5 b0^(-1/2) - 0.5 b0^(-3/2) b)
-        allowed = JERK_MARGIN * limits.max_jerk * h
+        allowed = JERK_MARGIN * limits.max_jerk * h * eased[between]
         constant = 1.5 * allowed * last**-0.5
         slope = sparse.diags(
             [0.5 * allowed * last**-1.5], [0 if closed else 1], shape=(inner, m)
@@ -161,7 +192,7 @@ def plan(caps: Array, bent: Array, h: float, limits: SpeedLimits, *, closed: boo
         slower = np.full(cells, limits.deceleration)
         if not closed:
             # Acceleration is zero at both ends, so jerk limits it in the first and the last cell.
-            standing = allowed * end**-0.5
+            standing = JERK_MARGIN * limits.max_jerk * h * end**-0.5
             faster[0] = min(faster[0], standing)
             slower[-1] = min(slower[-1], standing)
         bounds = np.concatenate([faster, slower, constant, constant, np.zeros(2 * inner), most])
