@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.inputs import foreign, observation_rows, started_rows
+from agents.wrappers import beneath
 from lpv_track_env.conditions import Actuation
 from lpv_track_env.conditions.vehicle import controlled_stop
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
@@ -122,7 +123,15 @@ class DrivingTask:
         ------
         TypeError
             If it is not a path tracking environment.
+        ValueError
+            Behind a wrapper that changes observations or actions (`agents.wrappers`).
         """
+        env, rescaling = beneath(env)
+        if rescaling:
+            raise ValueError(
+                "RescaleAction changes actions: agents.make(name, env) undoes it for the agent, "
+                "DrivingTask.of(env) cannot"
+            )
         names = ("layout", "vehicle", "control_period", "path", "actuation", "friction_range")
         try:
             return cls(*(env.get_wrapper_attr(name) for name in names))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import CHECKPOINTS, Action, Agent, DrivingTask
+from agents.wrappers import RescaledAgent, beneath
 from trajectories.arguments import flag, instance_of, shortened, shown
 from trajectories.naming import suggestion
 
@@ -162,7 +163,8 @@ def make(
     name
         One of `names()`, or "module:Class", "file.py:Class", or the .json of a learned policy.
     env
-        Environment to drive, wrapped or not.
+        Environment to drive, wrapped or not. `RescaleAction` is undone; any other wrapper that
+        changes observations or actions is refused (`agents.wrappers`).
     delay_compensation
         Predict the observation to the time at which the action takes effect
         (`agents.delay.DelayCompensated`). Default: if the environment's conditions have delays.
@@ -173,7 +175,8 @@ def make(
     Raises
     ------
     ValueError
-        For an unknown name or setting, or another kind of environment.
+        For an unknown name or setting, another kind of environment, or a wrapper that changes
+        observations or actions.
     """
     cls = agent_class(name)
     check_settings(name, settings)
@@ -183,6 +186,7 @@ def make(
     if compensates:
         settings["delay_compensation"] = delay_compensation
     try:
+        env, rescaling = beneath(env)
         task = DrivingTask.of(env)
         agent: Agent = cls(task, **settings)
     except TypeError as error:
@@ -194,7 +198,7 @@ def make(
         agent = DelayCompensated(agent, task, task.actuation, settings.get("model"))
     if env.observation_space.shape != (task.layout.size,):
         agent = TrackingPartAgent(agent, task)
-    return agent
+    return RescaledAgent(agent, rescaling) if rescaling else agent
 
 
 class TrackingPartAgent:
