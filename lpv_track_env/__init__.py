@@ -10,6 +10,8 @@ here.
 
 import importlib
 import importlib.util
+import warnings
+from pathlib import Path
 from types import ModuleType
 
 import gymnasium
@@ -21,6 +23,29 @@ HIGHWAY_TRACK = "lpv_track_env/HighwayTrack-v0"
 COMPILED_LIBRARY = True
 """Compiled functions of other packages may use this one; see `trajectories.compilation`."""
 
+
+def _check_neighbours() -> None:
+    """Tell of a folder or file beside the user's script that hides a package of this project.
+
+    Python finds it first, with or without an `__init__.py`. The environments need `trajectories`;
+    a user who needs no agents may have his own.
+    """
+    home = Path(__file__).parent.parent
+    for name in ("trajectories", "agents", "experiments"):
+        spec = importlib.util.find_spec(name)
+        found = spec and next(iter(spec.submodule_search_locations or ()), spec.origin)
+        if not found or Path(found).resolve() == (home / name).resolve():
+            continue
+        message = (
+            f"{found} hides the package {name!r} of lpv-track-env: rename it, or run your script "
+            "from another folder"
+        )
+        if name == "trajectories":
+            raise ImportError(message)
+        warnings.warn(message, UserWarning, stacklevel=3)
+
+
+_check_neighbours()
 if PATH_TRACKING not in gymnasium.registry:
     gymnasium.register(
         id=PATH_TRACKING,
