@@ -198,10 +198,11 @@ def points_of(raw: RawPath) -> Array:
 
 
 def _of(raw: RawPath, kept: NDArray[np.int_]) -> RawPath:
-    """Keep some points; a speed is the lowest up to the next one that is kept."""
+    """Keep some points, and every stop: it moves to the last kept point before it."""
     columns = {key: values[kept] for key, values in raw.columns.items()}
     if "speed" in columns:
-        columns["speed"] = np.minimum.reduceat(raw.columns["speed"], kept)
+        lowest = np.minimum.reduceat(raw.columns["speed"], kept)
+        columns["speed"] = np.where(lowest < MINIMUM_SPEED, lowest, columns["speed"])
     return replace(raw, columns=columns, places=[raw.places[k] for k in kept])
 
 

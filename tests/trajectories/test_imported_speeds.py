@@ -58,6 +58,22 @@ def test_squared_speeds_are_interpolated_so_that_accelerations_are_constant() ->
     np.testing.assert_allclose(path.acceleration, 0.5, rtol=1e-6)
 
 
+def test_thinning_keeps_the_speeds_at_the_points_that_are_left() -> None:
+    """Points 0.2 m apart, 4 m/s^2 of braking; only each twentieth is kept."""
+    x = np.arange(0.0, 40.01, 0.2)
+    speed = np.sqrt(400.0 - 2.0 * 4.0 * x)
+    points = np.column_stack([x, np.zeros(len(x))])
+    path = ReferencePath.from_waypoints(points, speed=speed, minimum_distance=3.9)
+    np.testing.assert_allclose(path.speed, np.sqrt(400.0 - 8.0 * path.arc_length), rtol=1e-6)
+    speed[100] = 0.0  # at 20 m, which is kept
+    stopped = ReferencePath.from_waypoints(points, speed=speed, minimum_distance=3.9)
+    assert stopped.arc_length[np.argmin(stopped.speed)] == pytest.approx(20.0, abs=0.125)
+    speed[[100, 110]] = speed[99], 0.0  # at 22 m, which is not
+    stopped = ReferencePath.from_waypoints(points, speed=speed, minimum_distance=3.9)
+    assert stopped.speed.min() == MINIMUM_SPEED
+    assert stopped.arc_length[np.argmin(stopped.speed)] == pytest.approx(20.0, abs=0.125)
+
+
 def test_a_stop_in_a_file_is_a_stop_of_the_path(tmp_path: Path) -> None:
     """One row at 0 m/s, at 50 m; and again between two nodes."""
     for place in (50, 33):
