@@ -8,19 +8,20 @@ from scipy.spatial import cKDTree
 from trajectories.shapes import Geometry
 
 SHARP = 0.115
-"""Curvature from which a bend is warned of, 1/m: a wheelbase of 5 m steers it with 30 degrees."""
+"""Curvature from which a bend is warned of where no vehicle is known, 1/m: a wheelbase of 5 m
+steers it with 30 degrees."""
 APPROACH, APPROACH_ALONG = 2.5, 20.0
 """m: a path approaches itself if it comes this close to a place this far away along the path."""
 CHUNK = 4096
 """Points whose neighbours are looked up at once."""
 
 
-def oddities(geometry: Geometry, closed: bool) -> list[str]:
-    """Describe what is accepted but unusual: a sharp bend, branches close to each other."""
+def oddities(geometry: Geometry, closed: bool, sharp: float = SHARP) -> list[str]:
+    """Describe what is accepted but unusual: a bend of more than `sharp`, branches close by."""
     found = []
     curvature = np.abs(geometry.curvature)
     sharpest = int(np.argmax(curvature))
-    if curvature[sharpest] > SHARP:
+    if curvature[sharpest] > sharp:
         found.append(
             f"bend of {1.0 / curvature[sharpest]:.1f} m radius at "
             f"{geometry.arc_length[sharpest]:.1f} m: more smoothing may widen it"
