@@ -194,9 +194,11 @@ class _Points:
         """Raise a ValueError that says which columns are missing."""
         header, width = self.table.header, len(self.table.rows[0])
         if not header:
+            rest = "v" if width == 3 else " ".join([IGNORED] * min(width - 2, 10))
             self.table.fail(
-                f'{width} columns without a header: name them, by columns=("x", "y", '
-                f"{IGNORED!r}), --columns x y {IGNORED}, or a header such as x_m,y_m"
+                f"{width} columns without a header: give it one, such as x_m,y_m,v_mps, or name "
+                f"them, in load(..., columns=[...]) or by lpv-track trajectories FILE --columns "
+                f"x y {rest} --write DIR"
             )
         if "latitude" in self or "longitude" in self:
             self.table.fail("a GPS log needs latitudes and longitudes: one of them is missing")

@@ -76,7 +76,7 @@ def test_a_line_is_said_once_in_every_command(
         (["T2", "--scale", "2"], "scale is an option of files, and 'T2' is none"),
         (["--open"], "closed is an option of files, and 'T1' is none"),
         (["u-turn", "--vehicle", "f1tenth"], "vehicle is an option of files, and 'u-turn'"),
-        (["FILE"], "3 columns without a header: name them"),
+        (["FILE"], "FILE --columns x y v --write DIR"),
         (["FILE", "--columns", "x", "y"], "has 3 columns, but 2 are named"),
         (["FILE", "--columns", "x", "y", "q"], "column name 'q' is not known"),
         (["FILE", "--columns", "x", "y", "v", "--scale", "0"], "scale must be positive"),
