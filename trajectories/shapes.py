@@ -371,7 +371,7 @@ def smooth(points: Array, tolerance: float, *, closed: bool = False) -> Smoothed
 
 def _arc_lengths(velocity: Callable[[Array], Array], at: Array, s: Array) -> Array:
     """Return the arc lengths (n,) at parameters (n,) of a curve whose nodes have arc lengths s."""
-    t = np.linspace(0.0, at[-1], 4 * len(s))
+    t = np.linspace(0.0, at[-1], len(s))
     speed = np.hypot(*velocity(t).T)
     lengths = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))])
     places: Array = np.interp(at, t, lengths * (s[-1] / lengths[-1]))
