@@ -22,7 +22,7 @@ from trajectories.arguments import shortened, shown
 from trajectories.columns import read_points
 from trajectories.curvature import circle_curvature, signed_waypoint_curvature, statistics
 from trajectories.fileio import checked, parse_json, read_bytes, write_atomically
-from trajectories.formats import HEAD, reader_of
+from trajectories.formats import HEAD, reader_of, refuse_folder
 from trajectories.import_options import USUAL, ImportOptions
 from trajectories.importers import path_of, read_gps, read_racetrack, read_xy
 from trajectories.path import ReferencePath
@@ -130,6 +130,7 @@ def read(file: str | Path, options: ImportOptions = USUAL) -> ReferencePath:
         If the file cannot be read; the message names the file and the line or column. Also for an
         option that means nothing for its format.
     """
+    refuse_folder(Path(file))
     start = read_bytes(file, MOST_BYTES)[:HEAD]
     if any(_is_format(line) for line in start.split(b"\n")[:50]):
         _refuse(file, "a native path file", options, NATIVE_OPTIONS)

@@ -4,6 +4,7 @@ Text tables and native files are no business of this module: `reader_of` returns
 is neither a table nor read here is refused by the name of its format, with what to do instead.
 """
 
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -40,6 +41,9 @@ REFUSED = {
     "ROS 1 bag": BAG,
     "MCAP recording": BAG,
     "rosbag2 database": BAG,
+    "ROS 2 bag": BAG,
+    "MDF measurement": CSV,
+    "VBOX log": "export it as GPX or CSV",
     # Arrays and tables
     "NumPy array": "use ReferencePath.from_waypoints(numpy.load(file))",
     "NumPy archive": "use ReferencePath.from_waypoints(numpy.load(file)[key])",
@@ -67,6 +71,7 @@ REFUSED = {
     "FlatGeobuf file": GEOJSON,
     "TopoJSON file": GEOJSON,
     "CAD drawing": CSV,
+    "point cloud": f"it has no points in order: {CSV}",
     # Pictures, documents, archives
     "picture": f"occupancy maps and pictures have no points in order: {CSV}",
     "PDF document": CSV,
@@ -79,6 +84,7 @@ REFUSED = {
 SIGNATURES = (
     (b"#ROSBAG V", "ROS 1 bag"),
     (b"\x89MCAP0\r\n", "MCAP recording"),
+    (b"MDF     ", "MDF measurement"),
     (b"SQLite format 3\0", "SQLite database"),
     (b"\x93NUMPY", "NumPy array"),
     (b"MATLAB 5.0 MAT-file", "MATLAB file"),
@@ -93,6 +99,9 @@ SIGNATURES = (
     (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "Excel workbook"),
     (b"\0\0\x27\x0a", "shapefile"),
     (b"fgb\x03", "FlatGeobuf file"),
+    (b"# .PCD", "point cloud"),
+    (b"ply\n", "point cloud"),
+    (b"LASF", "point cloud"),
     (b"\x89PNG\r\n", "picture"),
     (b"\xff\xd8\xff", "picture"),
     (b"GIF87a", "picture"),
@@ -151,6 +160,8 @@ TEXT_SUFFIXES = {
     ".pkl": "Python pickle", ".pickle": "Python pickle",
 }  # fmt: skip
 """Formats that are not read, by the suffix of text files."""
+NMEA_SUFFIXES = (".nmea", ".ubx", ".nma")
+"""Suffixes of logs whose sentences may stand between binary messages or behind times."""
 XML_SUFFIXES = {".gpx": "gpx", ".kml": "kml", ".xodr": "OpenDRIVE"}
 
 _ROOT = re.compile(r"\s*<(?:[\w.-]+:)?(?P<name>[\w.-]+)")
@@ -158,6 +169,13 @@ _BEFORE_ROOT = re.compile(
     r"\s*(?:<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>\[]*(?:\[.*?\])?\s*>)", re.DOTALL
 )
 _SENTENCE = re.compile(r"[$!](?:[A-Z]{2}[A-Z]{3}|P[A-Z]{3}),")
+_POSITION = re.compile(rb"\$[A-Z]{2}(?:GGA|RMC|GNS|GLL),")
+
+
+def refuse_folder(file: Path) -> None:
+    """Refuse the folder of a ROS 2 bag by its name."""
+    if os.path.isfile(file / "metadata.yaml"):  # noqa: PTH113  Path's raises for long names
+        _refuse(file, "ROS 2 bag")
 
 
 def reader_of(file: Path, head: bytes) -> Reader | None:
@@ -177,6 +195,8 @@ def reader_of(file: Path, head: bytes) -> Reader | None:
     """
     head, suffix = head[:HEAD], file.suffix.lower()
     _refuse_signature(file, head)
+    if suffix in NMEA_SUFFIXES and _POSITION.search(head):
+        return READERS["nmea"]
     wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))
     if b"\0" in head and not wide:
         if suffix in SUFFIXES:
@@ -191,6 +211,8 @@ def reader_of(file: Path, head: bytes) -> Reader | None:
         return READERS["geojson"]
     if _SENTENCE.match(text):
         return READERS["nmea"]
+    if "[column names]" in text:
+        _refuse(file, "VBOX log")
     if suffix in TEXT_SUFFIXES:
         _refuse(file, TEXT_SUFFIXES[suffix])
     return None
@@ -227,5 +249,5 @@ def _xml_reader(file: Path, text: str) -> Reader:
 
 
 def _refuse(file: Path, name: str) -> NoReturn:
-    article = "an" if name[0] in "AEO" or name[:2] in {"MC", "HD"} else "a"
+    article = "an" if name[0] in "AEO" or name[:2] in {"MC", "MD", "HD"} else "a"
     raise ValueError(f"{shortened(file)}: is {article} {name}, which is not read: {REFUSED[name]}")

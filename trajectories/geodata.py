@@ -312,9 +312,9 @@ def read_nmea(file: Path, part: str | None = None) -> RawPath:
     wrong = without = 0
     text = read_bytes(file, MOST_BYTES).decode("ascii", errors="replace")
     for number, line in enumerate(text.split("\n"), start=1):
-        if _NMEA.match(line):
+        if (found := _NMEA.search(line)) is not None:
             try:
-                fix = _nmea_fix(parse(line), f"line {number}")
+                fix = _nmea_fix(parse(line[found.start() :]), f"line {number}")
             except ValueError:
                 wrong += 1
                 continue

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from trajectories import load
 from trajectories.formats import REFUSED, ROOTS, SIGNATURES, SUFFIXES, TEXT_SUFFIXES, reader_of
 
 
@@ -60,6 +61,9 @@ def database(statement: str, folder: Path) -> bytes:
         ("x.png", b"\x89PNG\r\n\x1a\n\0", "a picture, which is not read: occupancy maps"),
         ("map.pgm", b"P5\n4 4\n255\n\0\0", "a picture"),
         ("x.pdf", b"%PDF-1.7\n", "a PDF document"),
+        ("x.vbo", b"File created\n[column names]\nsats time lat long\n", "a VBOX log"),
+        ("x.mf4", b"MDF     4.10    ", "an MDF measurement"),
+        ("x.pcd", b"# .PCD v0.7\nFIELDS x y z\n", "a point cloud"),
         ("x.yaml", b"image: map.pgm\nresolution: 0.05\n", "a YAML file"),
         ("x.osm", b'<?xml version="1.0"?>\n<osm version="0.6"></osm>', "OpenStreetMap or Lanelet2"),
         ("x.pbf", b"\0\0\0\x0d\n\tOSMHeader", "OpenStreetMap or Lanelet2 map"),
@@ -125,3 +129,11 @@ def test_a_root_behind_a_long_comment_is_known_by_the_suffix(suffix: str) -> Non
     assert reader_of(Path(f"x.{suffix}"), head) is not None
     with pytest.raises(ValueError, match="is XML with the root ''"):
         reader_of(Path("x.xml"), head)
+
+
+def test_the_folder_of_a_bag_is_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    with pytest.raises(ValueError, match="is a ROS 2 bag, which is not read: lpv-track bag"):
+        load(tmp_path)
+    with pytest.raises(ValueError, match="cannot be read"):
+        load(tmp_path / "metadata")

@@ -387,6 +387,14 @@ class TestNmea:
         assert len(raw.places) == 115
         assert raw.places[5] == "line 7"
 
+    def test_sentences_stand_behind_times_and_between_binary_messages(self, tmp_path: Path) -> None:
+        lines = [gga(k, a, b).encode() for k, (a, b) in enumerate(POINTS)]
+        stamped = b"\n".join(b"2026-05-01 10:00:00.1; " + line for line in lines)
+        mixed = b"\xb5\x62\x01\x07\0\0\xff\x0a".join(line + b"\r\n" for line in lines)
+        for content in (stamped, mixed):
+            raw = read(tmp_path / "log.nmea", content)
+            np.testing.assert_allclose(raw.columns["latitude"], LATITUDE, rtol=0.0, atol=1e-9)
+
     def test_a_log_of_wrong_checksums_is_refused(self, tmp_path: Path) -> None:
         text = "\n".join(gga(k, a, b)[:-2] + "00" for k, (a, b) in enumerate(POINTS))
         with pytest.raises(ValueError, match="NMEA sentences have a wrong checksum or"):
