@@ -5,6 +5,7 @@ import importlib.util
 import inspect
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 
 from agents.base import CHECKPOINTS, Action, Agent, DrivingTask
 from agents.wrappers import RescaledAgent, beneath
+from lpv_track_env.vehicle import VehicleParameters
+from lpv_track_env.vehicle import load as load_vehicle
 from trajectories.arguments import flag, instance_of, shortened, shown
 from trajectories.naming import suggestion
 
@@ -37,7 +40,7 @@ REGISTRY: dict[str, str] = {
 POLICY_FILES = (".json", ".safetensors", ".zip")
 """Suffixes of policy files. The error for the last two says which file to give instead."""
 
-COMMON = ("delay_compensation",)
+COMMON = ("delay_compensation", "model")
 """Settings that `make` accepts for every agent."""
 
 
@@ -154,6 +157,7 @@ def make(
     env: gymnasium.Env[Any, Any],
     *,
     delay_compensation: bool | None = None,
+    model: str | Path | VehicleParameters | None = None,
     **settings: Any,
 ) -> Agent:
     """Make an agent for an environment.
@@ -169,6 +173,9 @@ def make(
         Predict the observation to the time at which the action takes effect
         (`agents.delay.DelayCompensated`). Default: if the environment's conditions have delays.
         Classes with `compensates_delays` receive this setting and do it themselves.
+    model
+        Vehicle that the agent takes for the one it drives: a preset's name, a .json file or
+        `VehicleParameters`. Default: the environment's own.
     **settings
         Keyword arguments of the agent's class.
 
@@ -188,6 +195,8 @@ def make(
     try:
         env, rescaling = beneath(env)
         task = DrivingTask.of(env)
+        if model is not None:
+            task = replace(task, vehicle=load_vehicle(model))
         agent: Agent = cls(task, **settings)
     except TypeError as error:
         raise ValueError(f"agent {shown(name)}: {shortened(error)}") from error
@@ -195,7 +204,7 @@ def make(
     if wanted and not compensates:
         from agents.delay import DelayCompensated
 
-        agent = DelayCompensated(agent, task, task.actuation, settings.get("model"))
+        agent = DelayCompensated(agent, task, task.actuation)
     if env.observation_space.shape != (task.layout.size,):
         agent = TrackingPartAgent(agent, task)
     return RescaledAgent(agent, rescaling) if rescaling else agent

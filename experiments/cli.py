@@ -31,6 +31,8 @@ COMMANDS = {
     "switching": "Switch the NMPC's weights at random and by an adversary: are vehicles lost?",
     "highway": "Drive laps among highway-env's traffic, beside its own controllers.",
     "verify": "Check the real-time NMPC against independent solvers, models and derivatives.",
+    "identify": "Identify a vehicle's parameters, with their uncertainty, from logs of its drives.",
+    "excite": "Drive a simulated vehicle with rich excitation and record a log for identify.",
     "bag": "Exchange drives with ROS: export, info, reference, replay.",
     "run-parallel": "Drive in real time with estimator and controller as processes of their own.",
     "train": "Train a policy that drives, on random paths under randomised conditions.",

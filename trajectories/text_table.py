@@ -48,11 +48,16 @@ class TextTable:
         if len(self.header or self.rows[0]) > MOST_COLUMNS:
             self.fail(f"more than {MOST_COLUMNS} columns are not read")
 
-    def column(self, index: int) -> Array:
-        """Return the numbers of a column, (n,); a cell that is not a finite number is an error."""
+    def column(self, index: int, *, gaps: bool = False) -> Array:
+        """Return the numbers of a column, (n,); a cell that is not a finite number is an error.
+
+        With `gaps` an empty cell is NaN.
+        """
         name = shortened(self.header[index], 40) if self.header else str(index + 1)
-        values = np.empty(len(self.rows))
+        values = np.full(len(self.rows), np.nan)
         for k, (row, line) in enumerate(zip(self.rows, self.lines, strict=True)):
+            if gaps and row[index].strip() in {"", "nan", "NaN"}:
+                continue
             try:
                 values[k] = _number(row[index], self.separator)
             except ValueError:

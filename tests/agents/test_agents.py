@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import json
 import pickle
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from agents.base import TrackingAgent
 from agents.registry import check_settings
 from experiments.run.case import Case, run_case
 from lpv_track_env import PATH_TRACKING
+from lpv_track_env.vehicle import M2_MINIBUS
 from tests.helpers.learned_policies import DRIVING, driving_file
 
 each_agent = pytest.mark.parametrize("name", [*agents.names(), *DRIVING])
@@ -297,6 +299,30 @@ def test_ones_own_file_drives_and_its_contents_belong_to_the_case(tmp_path: Path
 def test_a_class_that_cannot_be_loaded_is_named(name: str) -> None:
     with pytest.raises(ValueError, match=f"agent '{name}' cannot be loaded"):
         agents.make(name, environment())
+
+
+@pytest.mark.parametrize("name", agents.names())
+def test_an_agent_drives_by_the_model_it_is_given(name: str, tmp_path: Path) -> None:
+    """`model` is the vehicle that an agent takes for its own: a name, a file or parameters."""
+    car = M2_MINIBUS.replace(front_cornering_stiffness=5e4, mass=2500.0)
+    file = tmp_path / "believed.json"
+    file.write_text(json.dumps(car.as_dict()))
+    observation, _ = environment().reset(options={"lateral_error": 0.02})
+    own, *others = [
+        new(name, **given).predict(observation)[0]
+        for given in ({}, {"model": car}, {"model": str(file)}, {"model": "m2-minibus"})
+    ]
+    np.testing.assert_array_equal(others[0], others[1])
+    np.testing.assert_array_equal(others[2], own)
+    if name in {"lpv-nmpc", "lqr"}:
+        assert not np.array_equal(others[0], own)
+
+
+def test_a_model_that_is_none_is_refused() -> None:
+    with pytest.raises(ValueError, match="unknown vehicle 'm2-minibuss'"):
+        new("stanley", model="m2-minibuss")
+    with pytest.raises(ValueError, match=r"a \.json file or VehicleParameters"):
+        new("stanley", model=3)
 
 
 def test_another_kind_of_environment_is_refused() -> None:

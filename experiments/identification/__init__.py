@@ -1,0 +1,1 @@
+"""Identification of a vehicle's parameters from logs of its drives (`lpv-track identify`)."""
