@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,8 @@ MOST_ROWS, MOST_COLUMNS = 1_000_000, 1000
 LONGEST_QUOTED = 100_000
 """Characters of a line whose quoted cells may hold separators."""
 
+_BEFORE_UNIT = re.compile(r"\s+(?=[\[(])")
+"""Blanks before a unit, where blanks separate cells."""
 SEPARATORS = (";", ",", "\t", None)
 """Separators of cells, None being blanks: of equals the first is taken."""
 
@@ -137,12 +140,14 @@ def _header(
             fits = len(names) == width
             if (fits or not comment) and _are_names(names, known):
                 return names if len(names) != width else tuple(map(_with_unit, names, units))
-            if fits and not header and not comment:
+            if fits and not header and not comment and any(names):
                 header = units = names
     return header
 
 
 def _names(text: str, separator: str | None) -> tuple[str, ...]:
+    if separator is None:
+        text = _BEFORE_UNIT.sub("", text)
     return tuple(cell.lower() for cell in _split(text.lstrip("#% "), separator))
 
 

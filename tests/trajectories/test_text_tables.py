@@ -191,13 +191,25 @@ def test_names_of_columns_hold_quantity_and_unit() -> None:
     [
         "x,y\nm,m\n" + rows(),
         "x,y,note\n[m],[m],\n" + rows(0.0),
+        "# y [m]  x [m]\n" + "".join(f"{y:.6f}  {x:.6f}\n" for x, y in ELLIPSE),
+        "x,y\n,\n" + rows(),
         "x,y\nmm,mm\n" + "".join(f"{1e3 * x:.1f},{1e3 * y:.1f}\n" for x, y in ELLIPSE),
         "x,y\n" + rows().replace("\n", ",\n"),
         rows().replace("\n", ",\n"),
         "x,y\r" + rows().replace("\n", "\r"),
         "sep=;\nx;y\n" + rows(separator=";", form="{:.3f}").replace(".", ","),
     ],
-    ids=["units", "brackets", "mm", "last comma", "last comma without header", "CR", "Excel's sep"],
+    ids=[
+        "units",
+        "brackets",
+        "blanks",
+        "empty",
+        "mm",
+        "last comma",
+        "last comma without header",
+        "CR",
+        "Excel's sep",
+    ],
 )
 def test_lines_of_units_last_separators_and_old_line_ends(text: str, tmp_path: Path) -> None:
     assert is_ellipse(load(written(tmp_path, text)))
@@ -216,6 +228,13 @@ def test_two_columns_that_may_be_meant_are_refused(header: str, tmp_path: Path) 
         load(written(tmp_path, f"{header}\n" + rows(0.0, 1.0)))
     with pytest.raises(ValueError, match="distinct points"):
         load(written(tmp_path, f"{header}\n" + rows(0.0, 1.0)), columns=["-", "-", "x", "y"])
+
+
+def test_decimal_commas_between_commas_are_refused(tmp_path: Path) -> None:
+    text = rows(separator=", ", form="{:.3f}").replace(".", ",")
+    for header in ("# east (m), north (m)\n", "east (m), north (m)\n", ""):
+        with pytest.raises(ValueError, match="column"):
+            load(written(tmp_path, header + text))
 
 
 def test_times_of_day_are_times(tmp_path: Path) -> None:
