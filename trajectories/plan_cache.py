@@ -40,7 +40,7 @@ _ENTRY = re.compile(r"[0-9a-f]{64}\.f64|\.[0-9a-f]{64}\.f64\.[0-9a-f]{8}\.tmp")
 
 
 def computed(
-    sources: Sequence[str], content: Iterable[bytes], count: int, compute: Callable[[], Array]
+    sources: Sequence[str], content: Iterable[bytes], compute: Callable[[], Array]
 ) -> Array:
     """Return an array (n,) from the disk, or compute it and keep it there.
 
@@ -50,8 +50,6 @@ def computed(
         Python files whose code computes the array.
     content
         All that the array depends on besides.
-    count
-        Its number of numbers, n.
     compute
         Function that computes the array.
     """
@@ -68,7 +66,7 @@ def computed(
         key.update(part)
     entry = folder / f"{key.hexdigest()}.f64"
     with contextlib.suppress(ValueError):
-        return _read(entry, count)
+        return _read(entry)
     array = compute()
     with contextlib.suppress(OSError):
         _write(entry, array)
@@ -99,10 +97,10 @@ def _made_with(sources: tuple[str, ...]) -> bytes:
     return digest.digest()
 
 
-def _read(entry: Path, count: int) -> Array:
+def _read(entry: Path) -> Array:
     """Read an entry; raise a ValueError if it is missing or damaged."""
-    content = read_bytes(entry, SIZE + 8 * count)
-    if CHECKSUM(content[SIZE:]).digest() != content[:SIZE] or len(content) != SIZE + 8 * count:
+    content = read_bytes(entry)
+    if CHECKSUM(content[SIZE:]).digest() != content[:SIZE]:
         raise ValueError(f"{entry.name} is damaged")
     # An entry in use is among the last that are removed.
     with contextlib.suppress(OSError):

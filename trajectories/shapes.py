@@ -23,9 +23,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from trajectories import plan_cache, smoothing
 from trajectories.arguments import Number, shown
 from trajectories.path import SPACING, ReferencePath
-from trajectories.smoothing import smoothing_spline
 from trajectories.speed import SpeedLimits, plan_speed
 
 Array = NDArray[np.float64]
@@ -340,11 +340,33 @@ def smooth(points: Array, tolerance: float, *, closed: bool = False) -> Smoothed
     ValueError
         If the tolerance is so large that little is left of the curve.
     """
+    points = np.ascontiguousarray(points)
+    content = (points.tobytes(), repr((float(tolerance), bool(closed), SPACING)).encode())
+    sources = (__file__, smoothing.__file__)
+    packed = plan_cache.computed(
+        sources, content, lambda: _packed(_smoothed(points, tolerance, closed=closed))
+    )
+    count, (length, largest, rms) = int(packed[0]), packed[1:4].tolist()
+    x, y, heading, curvature = packed[4 : 4 + 4 * count].reshape(4, count)
+    s = np.linspace(0.0, length, count)
+    geometry = Geometry(s, x, y, heading, curvature, np.ones(count))
+    return Smoothed(geometry, largest, rms, packed[4 + 4 * count :])
+
+
+def _packed(smoothed: Smoothed) -> Array:
+    """Return all numbers of a smoothed curve in one row."""
+    geometry, *deviations, places = smoothed
+    ends = [len(geometry.x), geometry.arc_length[-1], *deviations]
+    return np.concatenate([ends, *geometry[1:5], places])
+
+
+def _smoothed(points: Array, tolerance: float, *, closed: bool) -> Smoothed:
+    """Smooth as `smooth`."""
     from scipy.interpolate import make_interp_spline
 
     chain = np.vstack([points, points[:1]]) if closed else points
     if tolerance > 0.0:
-        spline, at = smoothing_spline(points, tolerance, closed=closed)
+        spline, at = smoothing.smoothing_spline(points, tolerance, closed=closed)
     else:
         at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(chain, axis=0).T))])
         spline = make_interp_spline(at, chain, k=3, bc_type="periodic" if closed else None)

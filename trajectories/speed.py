@@ -119,7 +119,7 @@ def _planned(
     content = (curvature, share, repr((spacing, limits, closed)).encode())
     sources = (__file__, speed_limits.__file__, speed_program.__file__)
     return plan_cache.computed(
-        sources, content, len(kappa), lambda: _plan(kappa, spacing, limits, closed, shares)
+        sources, content, lambda: _plan(kappa, spacing, limits, closed, shares)
     )
 
 
