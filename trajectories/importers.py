@@ -6,7 +6,6 @@ speed: that of the file as far as the limits allow, or a planned jerk-limited pr
 """
 
 import logging
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from trajectories.cleaning import Findings, cleaned, geographic, points_of
 from trajectories.columns import read_points
 from trajectories.import_options import IMPORT_LIMITS, NO_LIMITS, USUAL, ImportOptions
 from trajectories.naming import choose
-from trajectories.oddities import SHARP, oddities
+from trajectories.oddities import oddities
 from trajectories.path import MINIMUM_SPEED, ReferencePath
 from trajectories.raw_path import RawPath
 from trajectories.shapes import Smoothed, smooth
@@ -188,9 +187,7 @@ def path_of(raw: RawPath, options: ImportOptions = USUAL) -> ReferencePath:
         smoothed = smooth(points_of(points), smoothing, closed=closed)
     except ValueError as error:  # a spline that swings out to kilometres between few points
         raw.fail(str(error))
-    # Which bends are too sharp for a vehicle is said where it is known to drive.
-    sharp = SHARP if options.vehicle is None else math.inf
-    for oddity in oddities(smoothed.geometry, closed, sharp):
+    for oddity in oddities(smoothed.geometry, closed, float(np.median(np.diff(smoothed.places)))):
         findings.warn(oddity)
     speed = _speed(points, smoothed, closed, options, findings)
     limits = options.planning()

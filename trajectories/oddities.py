@@ -1,4 +1,4 @@
-"""What is accepted of an imported path but unusual: sharp bends, branches close to each other."""
+"""What is accepted of an imported path but unusual: kinks, branches close to each other."""
 
 import math
 
@@ -7,24 +7,28 @@ from scipy.spatial import cKDTree
 
 from trajectories.shapes import Geometry
 
-SHARP = 0.115
-"""Curvature from which a bend is warned of where no vehicle is known, 1/m: a wheelbase of 5 m
-steers it with 30 degrees."""
+KINK = 1.0
+"""rad: turn over the distance between two points from which a bend is warned of. What a vehicle can
+steer is another matter, of which only it knows."""
 APPROACH, APPROACH_ALONG = 2.5, 20.0
 """m: a path approaches itself if it comes this close to a place this far away along the path."""
 CHUNK = 4096
 """Points whose neighbours are looked up at once."""
 
 
-def oddities(geometry: Geometry, closed: bool, sharp: float = SHARP) -> list[str]:
-    """Describe what is accepted but unusual: a bend of more than `sharp`, branches close by."""
+def oddities(geometry: Geometry, closed: bool, spacing: float) -> list[str]:
+    """Describe what is accepted but unusual of a path through points that are `spacing` (m) apart.
+
+    That is a bend which the points do not resolve, and branches that are close to each other.
+    """
     found = []
     curvature = np.abs(geometry.curvature)
     sharpest = int(np.argmax(curvature))
-    if curvature[sharpest] > sharp:
+    if curvature[sharpest] * spacing > KINK:
         found.append(
             f"bend of {1.0 / curvature[sharpest]:.1f} m radius at "
-            f"{geometry.arc_length[sharpest]:.1f} m: more smoothing may widen it"
+            f"{geometry.arc_length[sharpest]:.1f} m between points {spacing:.2g} m apart: more "
+            "smoothing may widen it"
         )
     near = self_approach(geometry, closed)
     if near is not None:

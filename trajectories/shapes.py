@@ -376,7 +376,7 @@ def _smoothed(points: Array, tolerance: float, *, closed: bool) -> Smoothed:
             f"a smoothing of {tolerance:g} m leaves {at[-1]:.3g} m of a path that is "
             f"{across:.4g} m across: take less"
         )
-    deviation = np.hypot(*(spline(at) - chain).T)
+    deviation = np.hypot(*(spline(at[: len(points)]) - points).T)
     first, second = spline.derivative(), spline.derivative(2)
 
     def curve(t: Array) -> Derivatives:

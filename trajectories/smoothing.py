@@ -41,7 +41,7 @@ PENALTY_RESOLUTION = 0.05
 """Width of the bracket, in powers of ten, at which the bisection ends."""
 PASSES = 4
 """Number of fits, each over the arc length of the one before."""
-GAP, FAINT = 10.0, 1e-6
+GAP, FAINT = 10.0, 1e-5
 """Multiple of the median distance from which the chord over a gap counts, too, with this weight for
 each knot (times the penalty): without it a bend that ends at a gap would go on into the gap."""
 HEAVIEST = 1e8

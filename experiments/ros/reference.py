@@ -164,7 +164,7 @@ def _line(
     noise = float(np.sqrt(np.mean(distance**2)))
     at, chain = _resampled(splines, time)
     shape = smooth(chain + centre, max(SHAPE_TOLERANCE, SHAPE_SHARE * noise))
-    warnings.extend(oddities(shape.geometry, closed=False))
+    warnings.extend(oddities(shape.geometry, closed=False, spacing=SPACING))
     metadata.update(
         smoothing="cross-validated" if smoothing is None else smoothing,
         rms_deviation=noise, max_deviation=float(distance.max()),

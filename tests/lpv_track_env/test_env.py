@@ -831,8 +831,8 @@ def test_a_bend_too_sharp_is_told_with_the_limit_that_binds(
         make(trajectory=str(file), vehicle=car)
     texts = [str(one.message) for one in caught]
     assert len(texts) == 2
-    assert "bend of 1.4 m radius at 50.2 m: more smoothing may widen it" in texts[0]
-    assert re.search(rf"'corner': bend of 1.4 m radius at 50.2 m, {limit}", texts[1])
+    assert "bend of 1.4 m radius at 50.1 m between points 5 m apart: more smoothing" in texts[0]
+    assert re.search(rf"'corner': bend of 1.4 m radius at 50.1 m, {limit}", texts[1])
 
 
 def test_a_bend_that_the_vehicle_takes_is_not_told(tmp_path: Path) -> None:

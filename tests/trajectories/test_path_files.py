@@ -336,7 +336,10 @@ def test_warnings_are_given_and_kept(tmp_path: Path) -> None:
     tight = np.column_stack([np.r_[0:20:1.0, 20 + 4 * np.sin(np.linspace(0, np.pi, 9)), 19:0:-1.0],
                              np.r_[np.zeros(20), 4 - 4 * np.cos(np.linspace(0, np.pi, 9)),
                                    np.full(19, 8.0)]])  # fmt: skip
-    slow = warned(tight, "m: more smoothing may widen it")
+    slow = read(table(tmp_path, tight))
+    assert slow.metadata["warnings"] == []
+    corner = np.column_stack([np.r_[0:31:5, np.full(6, 30.0)], np.r_[np.zeros(7), 5:31:5]])
+    warned(corner, "between points 5 m apart: more smoothing may widen it")
     bend = np.abs(slow.curvature) > 0.2
     assert bend.any()
     assert slow.speed[bend].max() <= math.sqrt(2.0 / 0.2) * 1.01
