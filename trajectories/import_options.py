@@ -54,8 +54,9 @@ class ImportOptions:
     scale
         Factor on all coordinates and widths.
     smoothing
-        Largest rms deviation of the path from the (scaled) points, m; 0 interpolates. By default
-        0.05, and 0.2 for latitudes and longitudes.
+        Largest rms deviation of the path from the (scaled) points, m, and a third of the largest
+        one at any point; 0 interpolates. By default 0.05, and 0.2 for latitudes and longitudes,
+        times `scale` if that is below 1.
     minimum_distance
         m: points nearer than this to the last kept one are left out. By default points at the same
         place (1 mm) are merged, and latitudes and longitudes take the smallest of 1, 2 and 4 m that

@@ -182,7 +182,8 @@ def path_of(raw: RawPath, options: ImportOptions = USUAL) -> ReferencePath:
     points, closed = cleaned(raw, options, findings)
     smoothing = options.smoothing
     if smoothing is None:
-        smoothing = GPS_SMOOTHING if geographic(raw) else SMOOTHING
+        # The jitter of points that are scaled down has become smaller, too.
+        smoothing = min(options.scale, 1.0) * (GPS_SMOOTHING if geographic(raw) else SMOOTHING)
     try:
         smoothed = smooth(points_of(points), smoothing, closed=closed)
     except ValueError as error:  # a spline that swings out to kilometres between few points

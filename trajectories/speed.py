@@ -29,7 +29,7 @@ GRID, COARSEST_GRID, FINE_CELLS = 1.0, 2.0, 3000
 these: their number stays, until their length is the second."""
 CELL_TURN = 0.25
 """rad: largest turn in a cell of the grid, which small cars' bends need, up to `FINE_CELLS`."""
-ROUNDS, KEPT = 8, 1.005
+ROUNDS, KEPT = 12, 1.005
 """Largest number of plans for a path, and the excess over a limit that is not worth another."""
 STEERING_MARGIN = 0.96
 """Share of the steering rate that is used."""
