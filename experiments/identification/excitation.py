@@ -84,7 +84,7 @@ class Exciter:
         back = -(y / (speed * RETURN_TIME) + psi) / RETURN_TIME * 3.0
         delta = limit * self._tone(0, time) + np.clip(back * car.wheelbase / speed, -limit, limit)
         low, high = car.longitudinal_acceleration_range
-        strength = 0.5 * min(-low, high)
+        strength = 0.5 * min(-low, high, self.speeds[0])
         a = (
             car.rolling_deceleration
             + strength * self._tone(1, time)

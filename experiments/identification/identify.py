@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.identification import motion
 from experiments.identification.fit import GUESSED, Fit, WindowFit
 from experiments.identification.log import CHANNELS, Log
 from experiments.identification.model import (
@@ -167,6 +168,8 @@ def identify(
     ValueError
         If too little can be fitted, or the identified vehicle is not plausible.
     """
+    for log in logs:
+        motion.check(log)
     fitted, checked, counts, excitation = _cut(
         logs, window, _step(logs, nominal, longest_step), math.isinf(friction)
     )
@@ -204,8 +207,8 @@ Part = tuple[Log, Windows]
 
 
 def _step(logs: Sequence[Log], nominal: VehicleParameters, longest: float) -> float:
-    """Return the integration step that resolves the lateral poles where the logs are slowest."""
-    speeds = np.concatenate([_speed(log, next(iter(log.readings.values()))[0]) for log in logs])
+    """Return the step that resolves the lateral poles where the logs are slowest, s."""
+    speeds = np.concatenate([motion.speed(log, np.arange(*log.span, longest)) for log in logs])
     driven = speeds[speeds >= LOW_SPEED]
     slowest = float(driven.min()) if driven.size else LOW_SPEED
     return min(longest, RESOLVED / fastest_pole(slowest, nominal))
@@ -225,7 +228,7 @@ def _cut(
         kept = []
         for k, (a, n) in enumerate(zip(whole.first.tolist(), whole.steps.tolist(), strict=True)):
             times = whole.nodes[a : a + n + 1]
-            speed, turning = _speed(log, times), _turning(log, times)
+            speed, turning = motion.speed(log, times), motion.turning(log, times)
             lateral = float(np.percentile(np.abs(speed * turning), 95.0))
             if speed.min() < LOW_SPEED:
                 counts["slow"] += 1
@@ -261,49 +264,12 @@ def _chosen(whole: Windows, chosen: list[int]) -> Windows:
     )  # fmt: skip
 
 
-def _smooth_rate(times: Array, values: Array, at: Array) -> Array:
-    """Return a reading's rate of change: differences over a fifth of a second."""
-    ends = np.clip(np.array([at - 0.1, at + 0.1]), times[0], times[-1])
-    early, late = np.interp(ends, times, values)
-    return np.asarray((late - early) / np.maximum(ends[1] - ends[0], 1e-9))
-
-
-def _speed(log: Log, at: Array) -> Array:
-    if "vx" in log.readings:
-        return np.interp(at, *log.readings["vx"])
-    rates = [_smooth_rate(*log.readings[name], at) for name in ("x", "y")]
-    return np.hypot(*rates)
-
-
-def _heading(log: Log, at: Array) -> Array:
-    """Return the heading, or in its place the course over ground, rad."""
-    if "heading" in log.readings:
-        return np.interp(at, *log.readings["heading"])
-    if "x" not in log.readings:
-        return np.zeros_like(at)
-    rates = [_smooth_rate(*log.readings[name], at) for name in ("x", "y")]
-    return np.unwrap(np.arctan2(rates[1], rates[0]))
-
-
-def _turning(log: Log, at: Array) -> Array:
-    """Return the yaw rate, means over a fifth of a second, rad/s."""
-    if "yaw_rate" in log.readings:
-        times, values = log.readings["yaw_rate"]
-        steps = 0.5 * (values[1:] + values[:-1]) * np.diff(times)
-        return _smooth_rate(times, np.concatenate([[0.0], np.cumsum(steps)]), at)
-    if "heading" in log.readings:
-        return _smooth_rate(*log.readings["heading"], at)
-    around = np.array([at - 0.2, at + 0.2])
-    courses = np.array([_heading(log, one) for one in around])
-    return np.asarray(np.angle(np.exp(1j * (courses[1] - courses[0]))) / 0.4)
-
-
 def _first_states(parts: Sequence[Part], nominal: VehicleParameters) -> Array:
     """Guess the states (W, 6) at the windows' starts from what was read there."""
     rows = []
     for log, windows in parts:
         at = windows.nodes[windows.first]
-        speed, turning = _speed(log, at), _turning(log, at)
+        speed, turning = motion.speed(log, at), motion.turning(log, at)
         rows.append(
             np.column_stack(
                 [
@@ -311,7 +277,7 @@ def _first_states(parts: Sequence[Part], nominal: VehicleParameters) -> Array:
                     np.interp(at, *log.readings["vy"])
                     if "vy" in log.readings
                     else nominal.rear_axle_distance * turning,
-                    _heading(log, at),
+                    motion.heading(log, at),
                     turning,
                     *(
                         np.interp(at, *log.readings[name])

@@ -313,6 +313,36 @@ def test_hostile_logs_are_refused_in_one_line(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("columns", "factor", "message"),
+    [
+        (["steering_command"], 57.3, "steering up to [0-9.]+ rad; is it in degrees"),
+        (["steering_command"], -1.0, "turns right where the steering is positive"),
+        (
+            ["yaw_rate"],
+            57.3,
+            "heading changes 0.01[78][0-9]* times as fast as yaw_rate says; both in rad",
+        ),
+        (["heading"], 57.3, "heading changes 5[789].* times as fast"),
+        (["heading"], -1.0, "heading changes -1.* times as fast"),
+        (["vx"], 3.6, "positions move 0.278 times as fast as vx says; m and m/s"),
+        (["yaw_rate", "heading"], -1.0, "turns right where the steering is positive"),
+    ],
+)
+def test_other_units_and_signs_are_refused(
+    columns: list[str], factor: float, message: str, tmp_path: Path
+) -> None:
+    log = driven(tmp_path, seconds=30.0)
+    readings = {
+        name: (times, factor * values if name in columns else values)
+        for name, (times, values) in log.readings.items()
+    }
+    sent = log.commands[1] * np.array([1.0, factor if "steering_command" in columns else 1.0])
+    with pytest.raises(ValueError, match=message) as caught:
+        identify([Log("log", (log.commands[0], sent), readings)], WRONG, name="found")
+    assert len(str(caught.value)) < 200
+
+
 def test_dense_readings_are_averaged(tmp_path: Path) -> None:
     from experiments.identification.log import averaged
 
