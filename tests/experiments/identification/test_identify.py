@@ -321,7 +321,7 @@ def test_hostile_logs_are_refused_in_one_line(
         (
             ["yaw_rate"],
             57.3,
-            "heading changes 0.01[78][0-9]* times as fast as yaw_rate says; both in rad",
+            "heading changes 0.01[78].* as fast as yaw_rate says; both in rad",
         ),
         (["heading"], 57.3, "heading changes 5[789].* times as fast"),
         (["heading"], -1.0, "heading changes -1.* times as fast"),
