@@ -42,6 +42,7 @@ COMMANDS = {
     "import-policy": "Take the policy out of a model that Stable-Baselines3 has saved. The model "
     "must have been trained on lpv_track_env/PathTracking-v0, observations as they come, actions "
     "in SI units or behind gymnasium.wrappers.RescaleAction(env, -1, 1).",
+    "export": "Write a learned policy as an ONNX model, and check it against the agent.",
 }
 """Commands and their summaries; a command's module is `experiments.commands.NAME`."""
 
