@@ -75,8 +75,9 @@ def plan_speed(
     """Plan the fastest jerk-limited speed profile (n,), m/s, for a `curvature` (n,), 1/m.
 
     An open path starts and ends at `limits.end_speed`, or as fast as its bends allow if that is too
-    fast for them; the profile of a closed one is periodic,
-    its last node the first again.
+    fast for them; the profile of a closed one is periodic, its last node the first again. Limits
+    are kept to about 1 % at the nodes; lateral acceleration and steering rate are exceeded where
+    they would need less than `limits.min_speed`.
 
     Raises
     ------

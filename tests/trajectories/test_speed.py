@@ -69,7 +69,10 @@ def test_open_profile_starts_and_ends_at_the_end_speed(name: str) -> None:
 
 
 def check_limits(path: ReferencePath, limits: SpeedLimits) -> None:
-    """Check every limit by differences to 1 %, the seam of a closed path included."""
+    """Check every limit by differences to 1 %, the seam of a closed path included.
+
+    Lateral acceleration and steering rate are not checked where the speed is at its least.
+    """
     speed, curvature, h = path.speed, path.curvature, path.spacing
     acceleration, jerk = cells(speed, h, closed=path.closed)
     if path.closed:
