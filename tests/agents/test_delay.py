@@ -246,7 +246,7 @@ def drive(seed: int, **settings: Any) -> tuple[str, float]:
     agent = agents.make("lpv-nmpc", env, **settings)
     observation, info = env.reset(seed=seed)
     memory, start, worst = None, np.array([True]), 0.0
-    while "end" not in info:
+    while not info["end"]:
         action, memory = agent.predict(observation, memory, start)
         start = np.array([False])
         observation, *_, info = env.step(action)

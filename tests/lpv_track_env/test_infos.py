@@ -117,3 +117,32 @@ def test_infos_of_the_vector_environment_never_change_theirs(
         if mode is AutoresetMode.DISABLED and ended.any():
             env.reset(options={"reset_mask": ended})
     assert (finals > 0) == (mode is AutoresetMode.SAME_STEP)
+
+
+@pytest.mark.parametrize("conditions", ["simulation", "realtime"])
+def test_torchrl_batches_environments(conditions: str) -> None:
+    """TorchRL makes tensors of all infos, those of ended episodes included."""
+    gym = pytest.importorskip("torchrl.envs.libs.gym", reason="torchrl is not installed")
+    settings = {**SHORT, "conditions": conditions}
+    single = gymnasium.vector.SyncVectorEnv(
+        [lambda: gymnasium.make(PATH_TRACKING, **settings)] * 2,
+        autoreset_mode=AutoresetMode.SAME_STEP,
+    )
+    native = gymnasium.make_vec(
+        PATH_TRACKING, num_envs=2, vectorization_mode="vector_entry_point",
+        autoreset_mode="SameStep", **settings,
+    )  # fmt: skip
+    for env in (single, native):
+        driven = gym.GymWrapper(env).rollout(60, break_when_any_done=False)["next"]
+        assert driven["done"].sum() >= 4
+        assert driven["end"].unique().tolist() == [End.RUNNING, End.TIME_LIMIT]
+        assert driven["state"].shape == (2, 60, 6)
+
+
+def test_ends_pass_between_processes() -> None:
+    env = gymnasium.make_vec(PATH_TRACKING, num_envs=2, vectorization_mode="async", **SHORT)
+    env.reset(seed=0)
+    ends = {end for _ in range(21) for end in env.step(env.action_space.sample())[4]["end"]}
+    env.close()
+    assert End.TIME_LIMIT in ends
+    assert all(type(end) is End for end in ends)

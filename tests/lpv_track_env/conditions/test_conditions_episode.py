@@ -400,7 +400,7 @@ def test_without_fixes_the_vehicle_stops_and_goes_on_when_they_return() -> None:
         stopping.append(info["stopping"])
         deviations.append(info["position_deviation"])
         speeds.append(info["state"][VX])
-        if "end" in info:
+        if info["end"]:
             break
     # A fix that is used makes the position more certain; nothing else does.
     used = np.flatnonzero(np.diff(deviations) < 0.0) + 1
@@ -473,7 +473,7 @@ def test_the_steering_offset_is_found_and_taken_off() -> None:
         env = straight(estimator="ekf", steering_offset=0.02, calibrate_steering=calibrated)
         for _ in range(60):
             info = act(env, HOLD, 0.0)
-            if "end" in info:
+            if info["end"]:
                 break
         ends.append(info["state"][YAW_RATE])
     wanted = 0.02 * 10.0 / (CAR.wheelbase + CAR.understeer_gradient * 100.0)
