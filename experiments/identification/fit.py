@@ -100,6 +100,8 @@ class WindowFit:
     def residuals(self, initial: Array, parameters: Array) -> list[dict[str, tuple[Array, Array]]]:
         """Return, for each window and channel, residuals and their derivatives (n, `BLOCK`)."""
         states, sensitivities = self.predictor.predict(initial, parameters)
+        # Too long a trial step may not stay finite, which its cost tells.
+        sensitivities = np.nan_to_num(sensitivities, nan=0.0, posinf=0.0, neginf=0.0, copy=False)
         found = []
         for k, window in enumerate(self.predictor.windows):
             rows = {}
@@ -113,7 +115,7 @@ class WindowFit:
                     expected = expected + parameters[place] * factor
                     slope = slope.copy()
                     slope[:, STATE_SIZE + place] += factor
-                    if other is not None:
+                    if other is not None and parameters[place] != 0.0:
                         slope += parameters[place] * sensitivities[k, at, :, other]
                 rows[name] = values - expected, -slope
             found.append(rows)
@@ -141,6 +143,11 @@ class WindowFit:
         places = np.array(sorted(free), dtype=np.int64)
         parameters, initial = start.copy(), self.initial
         residuals = self.residuals(initial, parameters)
+        if not math.isfinite(_cost(residuals, dict.fromkeys(self.channels, 1.0))):
+            raise ValueError(
+                "the vehicle that the fit starts from does not stay finite over a window: its "
+                "axles, its stiffnesses or the log's units are wrong, or windows are too long"
+            )
         noise = self.noise_of(residuals)
         share, settled = 1.0, False
         step = _Step(residuals, noise, places, parameters, self.nominal)

@@ -343,6 +343,19 @@ def test_other_units_and_signs_are_refused(
     assert len(str(caught.value)) < 200
 
 
+def test_a_start_that_diverges_is_refused(tmp_path: Path) -> None:
+    """Tyres a thousand times as stiff need shorter steps than those that are taken."""
+    from experiments.identification.fit import WindowFit
+    from experiments.identification.identify import _cut
+
+    parts, _, _, _ = _cut([driven(tmp_path, seconds=40.0)], 3.0, 0.01, linear=False)
+    predictor = Predictor(WRONG, parts, math.inf)
+    initial = np.tile([9.0, 0.1, 0.2, 0.05, 1.0, 2.0], (len(predictor.windows), 1))
+    start = truth(WRONG, front_stiffness=1e5, rear_stiffness=1e5)
+    with pytest.raises(ValueError, match="does not stay finite over a window"):
+        WindowFit(predictor, initial, start).fit(start, ())
+
+
 def test_dense_readings_are_averaged(tmp_path: Path) -> None:
     from experiments.identification.log import averaged
 
