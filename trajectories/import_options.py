@@ -7,9 +7,11 @@ from typing import Any
 from trajectories.arguments import Number, flag, instance_of, numbers, shown
 from trajectories.naming import choose
 from trajectories.path import MINIMUM_SPEED
-from trajectories.speed_limits import UNLIMITED, PlannedVehicle, SpeedLimits
+from trajectories.speed_limits import CREEPING_SPEED, UNLIMITED, PlannedVehicle, SpeedLimits
 
-IMPORT_LIMITS = SpeedLimits(max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5)
+IMPORT_LIMITS = SpeedLimits(
+    max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5, min_speed=CREEPING_SPEED
+)
 """Default speed limits of an imported path: as for analytic shapes, but starting at 1.5 m/s."""
 NO_LIMITS = SpeedLimits(
     max_speed=UNLIMITED, max_lateral_acceleration=UNLIMITED, max_acceleration=UNLIMITED,
