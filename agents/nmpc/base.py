@@ -54,7 +54,8 @@ class NmpcSettings:
     weights
         Fixed weights, a schedule, or the file of a schedule. Either may be given as a mapping, too:
         `{"Q": [4 numbers], "S": [4], "R": [2], "R_rate": [2]}`, or a schedule in the form of its
-        file. Once the settings are made, these are `TrackingWeights` or a `WeightSchedule`.
+        file. Once the settings are made, these are `TrackingWeights` or a `WeightSchedule`; None
+        takes those of the vehicle's size, `TrackingWeights.of`.
     selection
         Rule by which a schedule chooses: "band" from the sharpest curvature in the preview at every
         step, or "path" once from the path's sharpest curvature, the paper's rule.
@@ -103,8 +104,8 @@ class NmpcSettings:
             choose("friction", self.friction, FRICTIONS)
         else:
             check_fields(self, {"friction": FRICTION})
-        weights = TrackingWeights() if self.weights is None else weights_from(self.weights)
-        object.__setattr__(self, "weights", weights)
+        if self.weights is not None:
+            object.__setattr__(self, "weights", weights_from(self.weights))
 
     def friction_in(self, task: DrivingTask) -> float:
         """Return the model's coefficient of friction for a task, or the largest estimate.
@@ -234,6 +235,8 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
         self._stanley = Stanley(task)
         self.rejected_weights = 0
         weights: Any = settings.weights
+        if weights is None:
+            weights = TrackingWeights.of(self.problem.vehicle)
         if isinstance(weights, WeightSchedule) and settings.selection == "path":
             weights = weights.for_path(task.path)
         self.switching = Switching(weights, task.control_period)

@@ -229,3 +229,15 @@ def test_steering_rate_weighs_lateral_jerk_at_speed(car: VehicleParameters) -> N
         assert scheduled[11] == pytest.approx(12.0 * (1.0 + (gain / 30.0) ** 2), rel=1e-9)
         np.testing.assert_array_equal(scheduled[:11], weights[:11])
     assert weights[11] == 12.0
+
+
+def test_positions_weigh_by_the_size_of_small_vehicles() -> None:
+    full, small = (
+        TrackingWeights.of(VEHICLES["m2-minibus"]),
+        TrackingWeights.of(VEHICLES["f1tenth"]),
+    )
+    assert full == TrackingWeights()
+    factor = (2.0 / 0.3302) ** 2
+    assert np.array(small.Q) / full.Q == pytest.approx([1.0, 1.0, factor, factor])
+    assert np.array(small.S) / full.S == pytest.approx([1.0, 1.0, factor, factor])
+    assert (small.R, small.R_rate) == (full.R, full.R_rate)
