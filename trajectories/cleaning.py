@@ -23,14 +23,14 @@ DUPLICATE = 1e-3
 GAP_FACTOR = 10.0
 """Multiple of the median distance from which a gap is warned of."""
 MINIMUM_LENGTH, MAXIMUM_LENGTH = 1.0, 30_000.0
-"""m: other lengths suggest that the coordinates are not metres."""
+"""Bounds of a path's length, m; other lengths suggest that the coordinates are not metres."""
 LARGEST_COORDINATE = 1e7
 """m: larger coordinates are not on any map of the Earth."""
 
 
 @dataclass
 class Findings:
-    """What is said of an import: flaws that are accepted, remarks, and the path's metadata.
+    """Report of an import: warnings of flaws that are accepted, notes, and the path's metadata.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class Findings:
 
 
 def cleaned(raw: RawPath, options: ImportOptions, findings: Findings) -> tuple[RawPath, bool]:
-    """Return the points with columns x and y, m, that a path can go through, and if it is closed.
+    """Return points with columns x and y, m, fit for a path, and whether the path is closed.
 
     A closed path's first point is not repeated at its end.
 

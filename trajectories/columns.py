@@ -25,7 +25,7 @@ LENGTHS = {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3}
 ANGLES = {"deg": 1.0, "degrees": 1.0, "°": 1.0, "rad": math.degrees(1.0)}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 NUMBERS = {"1": 1.0}
-"""Factors that make metres, degrees and seconds of a unit."""
+"""Factors from a unit to m, deg, s and 1."""
 NAMES: dict[str, tuple[dict[str, float], str]] = {
     "x": (LENGTHS, "x east easting utm_e utm_east utm_easting utm_x pos_x position_x x_ref"),
     "y": (LENGTHS, "y north northing utm_n utm_north utm_northing utm_y pos_y position_y y_ref"),
@@ -51,18 +51,22 @@ KNOWN = {
     for rank, name in enumerate(names.split())
     for unit, factor in {"": 1.0, **units}.items()
 }
+"""Quantity, rank and factor by name."""
+KNOWN_NAMES = "known are x, y, v, lat, lon, h, t, w_right, w_left and others, with units as v_kmh"
+"""End of messages on names."""
 _NAME = re.compile(r"(.*?)\s*(?:[(\[]([^)\]]*)[)\]])?", re.DOTALL)
 """Name and unit of a column."""
 _MESSAGE = re.compile(r"^.*_(?=position_[xy]$|linear_x$)")
 """Names of ROS messages before a field, as in `field.pose.pose.position.x`."""
 UNNEEDED = ("height", "time", "sideways")
-"""Quantities that another unit makes another thing, such as a temperature."""
+"""Quantities that no path needs: a column with the name of one but an unknown unit, such as the
+temperature `T [C]`, is left out."""
 IGNORED = "-"
 """Name of a column that is not read."""
 
 
 class Column(NamedTuple):
-    """A column's quantity, the rank of its name, and its unit in the usual one, NaN if unknown."""
+    """Quantity of a column, rank of its name, and factor to the usual unit (NaN: unknown unit)."""
 
     quantity: str
     rank: int
@@ -70,7 +74,7 @@ class Column(NamedTuple):
 
 
 def known(name: str) -> Column | None:
-    """Return what a column's name says; None for an unknown one."""
+    """Return the column that a name stands for; None for an unknown name."""
     words, unit = _NAME.fullmatch(name.lower()).groups()  # type: ignore[union-attr]
     plain = re.sub(r"[\s./-]+", "_", words.strip())
     found = KNOWN.get(_MESSAGE.sub("", plain))
@@ -106,9 +110,6 @@ def read_points(
             if name != IGNORED and known(name) is None:
                 table.fail(f"column name {shown(name)} is not known: {KNOWN_NAMES}")
     return _Points(replace(table, header=header), options).raw_path()
-
-
-KNOWN_NAMES = "known are x, y, v, lat, lon, h, t, w_right, w_left and others, with units as v_kmh"
 
 
 class _Points:

@@ -141,6 +141,23 @@ def _finite(text: str) -> float:
     return value
 
 
+def finite_number(text: object, name: object, what: str) -> float:
+    """Return the number in a text, or a number of JSON, that `what` is.
+
+    Raises
+    ------
+    ValueError
+        In one line that begins with `name`, for anything that is not a finite number.
+    """
+    try:
+        value = math.nan if isinstance(text, bool) else float(text)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{shortened(name)}: {what}: {shown(text)} is not a finite number")
+    return value
+
+
 def _integer(text: str) -> int:
     if len(text) > 20 or abs(int(text)) > LARGEST_INTEGER:
         raise ValueError(f"integer {shown(text)} is beyond 64 bits")

@@ -163,6 +163,7 @@ TEXT_SUFFIXES = {
 NMEA_SUFFIXES = (".nmea", ".ubx", ".nma")
 """Suffixes of logs whose sentences may stand between binary messages or behind times."""
 XML_SUFFIXES = {".gpx": "gpx", ".kml": "kml", ".xodr": "OpenDRIVE"}
+"""Roots of XML files by suffix, for those that begin with more than `HEAD` bytes of comments."""
 
 _ROOT = re.compile(r"\s*<(?:[\w.-]+:)?(?P<name>[\w.-]+)")
 _BEFORE_ROOT = re.compile(
@@ -191,7 +192,7 @@ def reader_of(file: Path, head: bytes) -> Reader | None:
     Raises
     ------
     ValueError
-        In one line that names the format, for one that is not read, and says what to do.
+        For a format that is not read, in one line that names it and says what to do.
     """
     head, suffix = head[:HEAD], file.suffix.lower()
     _refuse_signature(file, head)

@@ -18,16 +18,16 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from trajectories.arguments import shortened, shown
-from trajectories.fileio import read_bytes, read_json
+from trajectories.fileio import finite_number, read_bytes, read_json
 from trajectories.geodesy import east_north_up
+from trajectories.import_options import SPEED_UNITS
 from trajectories.pieces import Piece, Pieces
 from trajectories.raw_path import RawPath
 from trajectories.text_table import MOST_BYTES
 from trajectories.xml_tree import read_xml
 
-KNOT = 1852.0 / 3600.0
-"""m/s."""
 DAY = 86_400.0
+"""s."""
 WGS84 = ("4326", "4979", "CRS84", "CRS84H")
 """Ends of names of coordinate systems that are latitude and longitude on WGS-84."""
 _NMEA = re.compile(r"\$..(GGA|RMC|GNS|GLL),")
@@ -91,17 +91,6 @@ def _path(file: Path, kind: str, lines: Sequence[Line], part: str | None) -> Raw
     return pieces.path(part)
 
 
-def _number(text: Any, file: Path, what: str) -> float:
-    """Return a finite number from text or JSON."""
-    try:
-        value = math.nan if isinstance(text, bool) else float(text)
-    except (TypeError, ValueError):
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{shortened(file)}: {what}: {shown(text)} is not a finite number")
-    return value
-
-
 def _stamp(text: str, file: Path, what: str) -> float:
     """Return an ISO 8601 time in seconds since 1970; without a zone it is UTC."""
     try:
@@ -144,14 +133,14 @@ def _gpx_fix(point: Element, file: Path, place: str) -> Fix:
         return None if found is None or not (found.text or "").strip() else found.text
 
     latitude, longitude = (
-        _number(point.get(key), file, f"{place}: {key}") for key in ("lat", "lon")
+        finite_number(point.get(key), file, f"{place}: {key}") for key in ("lat", "lon")
     )
     height, time, speed = child("ele"), child("time"), child("speed")
     return Fix(
         latitude, longitude,
-        None if height is None else _number(height, file, f"{place}: ele"),
+        None if height is None else finite_number(height, file, f"{place}: ele"),
         None if time is None else _stamp(time, file, f"{place}: time"),
-        None if speed is None else _number(speed, file, f"{place}: speed"),
+        None if speed is None else finite_number(speed, file, f"{place}: speed"),
         place,
     )  # fmt: skip
 
@@ -207,12 +196,12 @@ def _track_fixes(track: Element, file: Path) -> list[Fix]:
 
 
 def _fix(values: Any, file: Path, place: str) -> Fix:
-    """Return a position of longitude, latitude and perhaps height, in this order."""
+    """Return the position that longitude, latitude and perhaps height, in this order, stand for."""
     if not isinstance(values, list) or len(values) < 2:
         raise ValueError(
             f"{shortened(file)}: {place}: {shown(values)} is not longitude, latitude[, height]"
         )
-    numbers = [_number(value, file, place) for value in values[:3]]
+    numbers = [finite_number(value, file, place) for value in values[:3]]
     return Fix(numbers[1], numbers[0], numbers[2] if len(numbers) > 2 else None, place=place)
 
 
@@ -366,7 +355,7 @@ def _nmea_fix(sentence: Any, place: str) -> Fix | None:
     if kind == "GGA" and isinstance(sentence.altitude, float):
         known["height"] = sentence.altitude
     if kind == "RMC" and isinstance(sentence.spd_over_grnd, float):
-        known["speed"] = sentence.spd_over_grnd * KNOT
+        known["speed"] = sentence.spd_over_grnd * SPEED_UNITS["kn"]
     seconds = at.hour * 3600.0 + at.minute * 60.0 + at.second + at.microsecond * 1e-6
     fix = Fix(sentence.latitude, sentence.longitude, time=seconds, place=place, **known)
     if not all(math.isfinite(value) for value in fix[:5] if value is not None):

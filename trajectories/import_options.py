@@ -12,18 +12,19 @@ from trajectories.speed_limits import CREEPING_SPEED, UNLIMITED, PlannedVehicle,
 IMPORT_LIMITS = SpeedLimits(
     max_speed=10.0, max_lateral_acceleration=2.0, max_acceleration=1.5, min_speed=CREEPING_SPEED
 )
-"""Default speed limits of an imported path: as for analytic shapes, but starting at 1.5 m/s."""
+"""Speed limits of an imported path without a vehicle: as for analytic shapes, but it starts at 1.5
+m/s and slows down to `CREEPING_SPEED` at kinks."""
 NO_LIMITS = SpeedLimits(
     max_speed=UNLIMITED, max_lateral_acceleration=UNLIMITED, max_acceleration=UNLIMITED,
     max_jerk=UNLIMITED, max_steering_rate=UNLIMITED, wheelbase=1e-3, min_speed=MINIMUM_SPEED,
 )  # fmt: skip
-"""Limits under which all speeds of a file are kept."""
+"""Limits that leave all speeds of a file as they are."""
 SPEED_UNITS = {
     "m/s": 1.0, "mps": 1.0, "ms": 1.0, "m_s": 1.0, "km/h": 1.0 / 3.6, "kmh": 1.0 / 3.6,
     "kph": 1.0 / 3.6, "km_h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0,
     "knots": 1852.0 / 3600.0,
 }  # fmt: skip
-"""Factors that make m/s of a unit."""
+"""Factors from a unit to m/s."""
 SPEEDS = ("file", "planned")
 SCALES = Number(0.0, 1e9, above=True)
 DISTANCES = Number(0.0, 1e9, "m")
@@ -157,4 +158,4 @@ class ImportOptions:
 
 
 USUAL = ImportOptions()
-"""Options of a file that nobody has said anything about."""
+"""The defaults."""

@@ -1,8 +1,9 @@
 """Make paths of foreign points: racing circuits and lines, waypoints, GPS logs, arrays.
 
 Every import takes the same steps: checks, a smoothing spline whose deviation is reported,
-resampling at 0.25 m of arc length, heading and curvature from the spline's derivatives, and a
-speed: that of the file as far as the limits allow, or a planned jerk-limited profile.
+resampling at 0.25 m of arc length (less on tracks with tight bends), heading and curvature from the
+spline's derivatives, and a speed: that of the file as far as the limits allow, or a planned
+jerk-limited profile.
 """
 
 import logging
@@ -30,21 +31,21 @@ Array = NDArray[np.float64]
 
 LOG = logging.getLogger(__name__)
 SMOOTHING = 0.05
-"""m rms, and 3 times as much at any point: removes the jitter of points 5 m apart (on one track the
-largest curvature falls from 0.162 to 0.114 1/m)."""
 GPS_SMOOTHING = 0.2
-"""m rms."""
+"""Usual smoothing of metres and of latitudes and longitudes, m rms, and 3 times as much at any
+point. The first removes the jitter of points 5 m apart (on one track the largest curvature falls
+from 0.162 to 0.114 1/m)."""
 SAID = ("part", "missing", "skipped")
-"""Metadata of readers that belong in the line of what was imported."""
+"""Keys of readers' metadata whose texts are part of `metadata["imported"]`."""
 FASTEST = 200.0
-"""m/s: higher speeds suggest another unit."""
+"""Highest speed in a file, m/s; higher ones suggest another unit."""
 BINDING = {
     "top speed": ("max_speed",),
     "lateral acceleration": ("max_lateral_acceleration",),
     "steering rate": ("max_steering_rate", "wheelbase"),
     "acceleration or braking": ("max_acceleration", "max_deceleration"),
 }
-"""Limits that lower the speeds of a file."""
+"""Limits that may lower the speeds of a file, in words, with the fields of `SpeedLimits`."""
 
 
 def read_racetrack(
@@ -298,7 +299,7 @@ def _speed(
 
 
 def _compare_times(raw: RawPath, options: ImportOptions, findings: Findings) -> None:
-    """Warn of speeds that are in km/h by the times of the points."""
+    """Warn of speeds that, by the times of the points, are in km/h."""
     if "time" not in raw.columns:
         return
     speed, steps = raw.columns["speed"], np.diff(raw.columns["time"])
@@ -307,7 +308,7 @@ def _compare_times(raw: RawPath, options: ImportOptions, findings: Findings) -> 
     if 3.2 < np.median(driven / distances) < 4.0:
         findings.warn(
             "its speeds are 3.6 times those that follow from its times: if they are in km/h, "
-            "say so by speed_unit"
+            "give speed_unit='km/h'"
         )
 
 

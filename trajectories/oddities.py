@@ -1,4 +1,4 @@
-"""What is accepted of an imported path but unusual: kinks, branches close to each other."""
+"""Oddities of a path that are accepted with a warning: unresolved bends, close branches."""
 
 import math
 
@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 from trajectories.shapes import Geometry
 
 KINK = 1.0
-"""rad: turn over the distance between two points from which a bend is warned of. What a vehicle can
-steer is another matter, of which only it knows."""
+"""Turn over the distance between two points, rad, from which on a bend is warned of. Bends that a
+vehicle cannot steer are another matter: `lpv_track_env.reference` warns of them."""
 APPROACH, APPROACH_ALONG = 2.5, 20.0
 """m: a path approaches itself if it comes this close to a place this far away along the path."""
 CHUNK = 4096
@@ -17,9 +17,9 @@ CHUNK = 4096
 
 
 def oddities(geometry: Geometry, closed: bool, spacing: float) -> list[str]:
-    """Describe what is accepted but unusual of a path through points that are `spacing` (m) apart.
+    """Describe oddities of a path through points that are `spacing` (m) apart, in a sentence each.
 
-    That is a bend which the points do not resolve, and branches that are close to each other.
+    They are a bend that the points do not resolve, and branches that are close to each other.
     """
     found = []
     curvature = np.abs(geometry.curvature)

@@ -12,7 +12,8 @@ from trajectories import projection, table
 from trajectories.arguments import Number, Whole, array, flag, instance_of, shown
 
 SPACING = 0.25
-"""m between nodes of every path, up to fitting its length exactly."""
+"""Usual distance between nodes, m, up to fitting a path's length exactly; imported tracks with
+tight bends have less."""
 MINIMUM_POINTS = 4
 MINIMUM_SPEED = 0.05
 """m/s; a slower reference would take too long to arrive."""

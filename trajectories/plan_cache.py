@@ -2,7 +2,7 @@
 
 An entry's name is a digest of all that its numbers depend on, so it never becomes wrong, only
 unused. Entries are raw numbers with a checksum; nothing in them is executed or trusted. An entry
-that is damaged or cannot be read counts as missing, and a folder that cannot be written is none.
+that is damaged or cannot be read counts as missing; what cannot be written is not kept.
 
 The folder is `LPV_TRACK_CACHE` if that is set ("off" for none), otherwise `lpv-track` in the user's
 folder for caches. Other files in it are left alone.
@@ -32,11 +32,11 @@ MOST_BYTES = 256 * 2**20
 KEPT = 0.75
 """Share of `MOST_BYTES` that is left when entries are removed."""
 SEARCHED = "0"
-"""First digit of the names after which the folder is searched for what to remove: of one in 16."""
+"""First digit of an entry's name after whose writing the oldest are removed: once in 16 entries."""
 CHECKSUM = hashlib.sha256
 SIZE = CHECKSUM().digest_size
 _ENTRY = re.compile(r"[0-9a-f]{64}\.f64|\.[0-9a-f]{64}\.f64\.[0-9a-f]{8}\.tmp")
-"""Names of entries, and of those that were being written when their process died."""
+"""Names of entries, and of temporary files whose process died."""
 
 
 def computed(

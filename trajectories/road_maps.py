@@ -19,9 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trajectories.arguments import shortened, shown
+from trajectories.fileio import finite_number
 from trajectories.pieces import MEETS, Piece, Pieces
 from trajectories.raw_path import RawPath
 from trajectories.shapes import LENGTHS, integrate
+from trajectories.smoothing import chord_lengths
 from trajectories.xml_tree import read_xml
 
 Array = NDArray[np.float64]
@@ -64,13 +66,7 @@ class _Map:
 
     def number(self, text: str | None, what: str) -> float:
         """Return a finite number."""
-        try:
-            value = math.nan if text is None else float(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise self.refuse(f"{what}: {shown(text)} is not a finite number")
-        return value
+        return finite_number(text, self.file, what)
 
     def attribute(self, element: Element, key: str, what: str) -> float:
         """Return a number in an attribute."""
@@ -207,7 +203,7 @@ def _poly3(s: Array, coefficients: Sequence[float]) -> Local:
     a, b, c, d = coefficients
     u = np.linspace(0.0, s[-1], 20 * len(s))
     v = a + u * (b + u * (c + u * d))
-    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(u), np.diff(v)))])
+    lengths = chord_lengths(np.column_stack([u, v]))
     at = np.interp(s, lengths, u)
     return at, a + at * (b + at * (c + at * d)), np.arctan(b + at * (2.0 * c + 3.0 * at * d))
 
@@ -341,7 +337,7 @@ def _centre(found: _Map, lanelet: Element, what: str) -> Piece:
         bounds = _paired(*bounds)
     left, right = bounds
     centre, half = 0.5 * (left + right), 0.5 * np.hypot(*(left - right).T)
-    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(centre, axis=0).T))])
+    lengths = chord_lengths(centre)
     if not LENGTHS.holds(float(lengths[-1])):
         raise found.refuse(f"{what} is {lengths[-1]:.4g} m long, at most {LENGTHS.high:g} are read")
     at = _subdivided(lengths)
@@ -354,7 +350,7 @@ def _paired(left: Array, right: Array) -> list[Array]:
     """Give two bounds the same number of points, at the same shares of their lengths."""
     shares = []
     for bound in (left, right):
-        lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(bound, axis=0).T))])
+        lengths = chord_lengths(bound)
         shares.append(lengths / max(lengths[-1], 1e-9))
     both = np.union1d(*shares)
     return [

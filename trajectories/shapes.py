@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from trajectories import plan_cache, smoothing
 from trajectories.arguments import Number, shown
 from trajectories.path import SPACING, ReferencePath
+from trajectories.smoothing import ABSCISSAE, WEIGHTS, chord_lengths
 from trajectories.speed import SpeedLimits, plan_speed
 
 Array = NDArray[np.float64]
@@ -37,17 +38,14 @@ LENGTHS = Number(0.0, 30_000.0, "m")
 LEAST_LEFT = 0.5
 """Least length of a smoothed curve as a share of the diagonal of the box around its points."""
 TURN, MANY_NODES = 0.1, 8000
-"""rad: nodes of a smoothed curve are nearer than `SPACING` where it would turn by more from one to
-the next, as small cars' tracks do, but only up to this number of nodes."""
+"""Largest turn from node to node of a smoothed curve, rad: on the tracks of small cars the spacing
+is below `SPACING` for it, but not with more nodes than this number."""
 
 _SEGMENT = re.compile(
     r"^(?:S\s*(?P<straight>[\d.]+)"
     r"|(?P<side>[LR])\s*(?P<angle>[\d.]+)\s+r\s*(?P<radius>[\d.]+)"
     r"(?:\s+t\s*(?P<transition>[\d.]+))?(?:\s+a\s*(?P<share>[\d.]+))?)$"
 )
-# Abscissae and weights of 5-point Gauss-Legendre quadrature on [0, 1].
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
-_NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 
 
 class Geometry(NamedTuple):
@@ -225,9 +223,9 @@ def build(segments: Sequence[Segment]) -> Geometry:
 def integrate(heading: Callable[[Array], Array], s: Array) -> tuple[Array, Array]:
     """Integrate a heading function to positions x, y on a grid s, each (n,), from the origin."""
     steps = np.diff(s)
-    inner = heading((s[:-1, None] + steps[:, None] * _NODES).ravel()).reshape(-1, len(_NODES))
-    x = np.concatenate([[0.0], np.cumsum((np.cos(inner) @ _WEIGHTS) * steps)])
-    y = np.concatenate([[0.0], np.cumsum((np.sin(inner) @ _WEIGHTS) * steps)])
+    inner = heading((s[:-1, None] + steps[:, None] * ABSCISSAE).ravel()).reshape(-1, len(ABSCISSAE))
+    x = np.concatenate([[0.0], np.cumsum((np.cos(inner) @ WEIGHTS) * steps)])
+    y = np.concatenate([[0.0], np.cumsum((np.sin(inner) @ WEIGHTS) * steps)])
     return x, y
 
 
@@ -264,8 +262,10 @@ def parametric(
         dx, dy = curve(t)[2:4] if velocity is None else velocity(t)
         return np.hypot(dx, dy)
 
-    inner = speed((knots[:-1, None] + steps[:, None] * _NODES).ravel()).reshape(-1, len(_NODES))
-    lengths = np.concatenate([[0.0], np.cumsum((inner @ _WEIGHTS) * steps)])
+    inner = speed((knots[:-1, None] + steps[:, None] * ABSCISSAE).ravel()).reshape(
+        -1, len(ABSCISSAE)
+    )
+    lengths = np.concatenate([[0.0], np.cumsum((inner @ WEIGHTS) * steps)])
     s = grid(float(lengths[-1]))
     if turn < math.inf:
         sharpest = float(np.abs(_curvature(*curve(knots)[2:])).max())
@@ -275,8 +275,8 @@ def parametric(
     t = knots[index] + (s - lengths[index]) / speed(knots[index])
     for _ in range(3):
         span = t - knots[index]
-        partial = speed((knots[index][:, None] + span[:, None] * _NODES).ravel())
-        reached = lengths[index] + (partial.reshape(-1, len(_NODES)) @ _WEIGHTS) * span
+        partial = speed((knots[index][:, None] + span[:, None] * ABSCISSAE).ravel())
+        reached = lengths[index] + (partial.reshape(-1, len(ABSCISSAE)) @ WEIGHTS) * span
         t = t + (s - reached) / speed(t)
     x, y, dx, dy, ddx, ddy = curve(t)
     heading = np.unwrap(np.arctan2(dy, dx))
@@ -317,14 +317,14 @@ def smooth(points: Array, tolerance: float, *, closed: bool = False) -> Smoothed
     """Fit the smoothest curve that stays near points, and compute its geometry.
 
     The curve leaves the points by at most `tolerance` in the root mean square, and no point by more
-    than `smoothing.REACH` (3) times that. More smoothing does not sharpen bends: of five racing
-    circuits, whose points are 5 m apart, the largest curvatures fall from 0.116, 0.085, 0.117,
-    0.162 and 0.059 1/m at 0 to 0.094, 0.059, 0.099, 0.114 and 0.055 at 0.05 m, and to 0.078, 0.052,
-    0.090, 0.093 and 0.053 at 0.2 m. A hairpin of 8 m radius between straights of 1500 m has 0.149,
-    0.132, 0.130, 0.126 and 0.120 1/m at 0, 0.05, 0.1, 0.2 and 0.5 m. From GPS positions 5 m apart
-    with normal errors of 0.2 m on each axis, 0.2 m makes a curve that is 0.16 m (rms) from the
-    road, 0.090 1/m at most where the road has 0.083; errors of 0.5 m and 1 m need 0.5 m and 1 m of
-    smoothing for 0.088 and 0.096 1/m.
+    than about `smoothing.REACH` (3) times that, see `smoothing.smoothing_spline`. More smoothing
+    does not sharpen bends: of five racing circuits, whose points are 5 m apart, the largest
+    curvatures fall from 0.116, 0.085, 0.117, 0.162 and 0.059 1/m at 0 to 0.094, 0.059, 0.099, 0.114
+    and 0.055 at 0.05 m, and to 0.078, 0.052, 0.090, 0.093 and 0.053 at 0.2 m. A hairpin of 8 m
+    radius between straights of 1500 m has 0.149, 0.132, 0.130, 0.126 and 0.120 1/m at 0, 0.05, 0.1,
+    0.2 and 0.5 m. From GPS positions 5 m apart with normal errors of 0.2 m on each axis, 0.2 m
+    makes a curve that is 0.16 m (rms) from the road, 0.090 1/m at most where the road has 0.083;
+    errors of 0.5 m and 1 m need 0.5 m and 1 m of smoothing for 0.088 and 0.096 1/m.
 
     Parameters
     ----------
@@ -361,14 +361,14 @@ def _packed(smoothed: Smoothed) -> Array:
 
 
 def _smoothed(points: Array, tolerance: float, *, closed: bool) -> Smoothed:
-    """Smooth as `smooth`."""
+    """Compute the result of `smooth`."""
     from scipy.interpolate import make_interp_spline
 
     chain = np.vstack([points, points[:1]]) if closed else points
     if tolerance > 0.0:
         spline, at = smoothing.smoothing_spline(points, tolerance, closed=closed)
     else:
-        at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(chain, axis=0).T))])
+        at = chord_lengths(chain)
         spline = make_interp_spline(at, chain, k=3, bc_type="periodic" if closed else None)
     across = math.hypot(*np.ptp(points, axis=0))
     if at[-1] < LEAST_LEFT * across:

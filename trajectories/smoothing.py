@@ -42,29 +42,36 @@ PENALTY_RESOLUTION = 0.05
 PASSES = 4
 """Number of fits, each over the arc length of the one before."""
 GAP, FAINT = 10.0, 1e-5
-"""Multiple of the median distance from which the chord over a gap counts, too, with this weight for
-each knot (times the penalty): without it a bend that ends at a gap would go on into the gap."""
+"""A gap is longer than this multiple of the median distance. Points on its chord, one for each
+knot, are fitted with this faint weight (times the penalty): without them a bend that ends at a gap
+would go on into the gap."""
 HEAVIEST = 1e8
 """Largest weight of a point."""
 ROUNDS = 60
 """Largest number of solutions with other weights in a pass."""
 POWER = 1.5
-"""Power of a deviation by which its weight grows: 1 is slower, 2 may swing."""
+"""Power of a deviation with which its weight grows: 1 converges slower, 2 may oscillate."""
 GOAL, ARRIVED = 0.99, 1.01
-"""Share of the bound that the weights aim at, so that they arrive, and that counts as arrived."""
-# Abscissae and weights of 5-point Gauss-Legendre quadrature on [0, 1].
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
-_NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
+"""Share of the bound that the weights aim at, and the one at which they have arrived."""
+ABSCISSAE, WEIGHTS = np.polynomial.legendre.leggauss(5)
+ABSCISSAE, WEIGHTS = 0.5 * (ABSCISSAE + 1.0), 0.5 * WEIGHTS
+"""Those of 5-point Gauss-Legendre quadrature on [0, 1]."""
+
+
+def chord_lengths(points: Array) -> Array:
+    """Return the lengths (n,) of the polygon through (n, 2) points, from the first to each, m."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
 def smoothing_spline(points: Array, tolerance: float, *, closed: bool) -> tuple["BSpline", Array]:
     """Return the smoothest spline through (n, 2) points up to deviations, and their parameters.
 
-    The rms deviation is at most `tolerance`, the largest one `REACH` times that, m. The parameter
-    is within about a thousandth arc length. A closed curve has one more parameter, of its end.
+    The rms deviation is at most `tolerance`, the largest one about `REACH` times that, m; where
+    outliers must be followed so far, the rms of all may exceed it by a fifth. The parameter is arc
+    length to about a thousandth. A closed curve has one more parameter, that of its end.
     """
     chain = np.vstack([points, points[:1]]) if closed else points
-    at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(chain, axis=0).T))])
+    at = chord_lengths(chain)
     spacing, length = float(np.median(np.diff(at))), float(at[-1])
     cells = int(np.ceil(length / spacing))
     if cells > MANY_KNOTS:
@@ -83,15 +90,15 @@ def smoothing_spline(points: Array, tolerance: float, *, closed: bool) -> tuple[
 def _fitted(
     points: Array, at: Array, tolerance: float, cells: int, *, closed: bool
 ) -> tuple["BSpline", Array, float]:
-    """Fit a spline with so many cells; return it, the points' parameters, the largest deviation."""
+    """Fit a spline of `cells` cells; return it, the points' parameters, the largest deviation."""
     for left in reversed(range(PASSES)):
         spline, largest = _penalised(points, at, tolerance, cells, closed=closed)
         if left == 0:
             break
         steps = np.diff(at)
-        inner = spline.derivative()((at[:-1, None] + steps[:, None] * _NODES).ravel())
-        speeds = np.hypot(*inner.T).reshape(-1, len(_NODES))
-        at = np.concatenate([[0.0], np.cumsum((speeds @ _WEIGHTS) * steps)])
+        inner = spline.derivative()((at[:-1, None] + steps[:, None] * ABSCISSAE).ravel())
+        speeds = np.hypot(*inner.T).reshape(-1, len(ABSCISSAE))
+        at = np.concatenate([[0.0], np.cumsum((speeds @ WEIGHTS) * steps)])
     return spline, at, largest
 
 

@@ -25,8 +25,8 @@ Array = NDArray[np.float64]
 GRAVITY = 9.81
 """m/s^2."""
 GRID, COARSEST_GRID, FINE_CELLS = 1.0, 2.0, 3000
-"""Largest spacing of the linear programmes' grid, m, and that of a path with more cells than
-these: their number stays, until their length is the second."""
+"""Usual spacing of the linear programmes' grid, m, its largest spacing, and the number of cells
+that longer paths keep between these two."""
 CELL_TURN = 0.25
 """rad: largest turn in a cell of the grid, which small cars' bends need, up to `FINE_CELLS`."""
 ROUNDS, KEPT = 12, 1.005
@@ -108,7 +108,7 @@ def plan_speed(
 def _planned(
     curvature: bytes, spacing: float, limits: SpeedLimits, closed: bool, share: bytes
 ) -> Array:
-    """Plan as `plan_speed`, whose arrays are given as bytes."""
+    """Compute the result of `plan_speed`, whose arrays are given as bytes."""
     if (total := limits.max_total_acceleration) is not None:
         limits = replace(
             limits,
@@ -127,7 +127,7 @@ def _planned(
 def _plan(
     curvature: Array, spacing: float, limits: SpeedLimits, closed: bool, share: Array
 ) -> Array:
-    """Plan as `plan_speed`, again where the profile exceeds limits between the grid's nodes."""
+    """Plan on a grid, and anew with tighter bounds where limits are exceeded between its nodes."""
     caps = speed_caps(curvature, spacing, limits, share, closed=closed)
     length, sharpest = spacing * (len(curvature) - 1), float(np.abs(curvature).max())
     grid = min(max(length / FINE_CELLS, GRID), COARSEST_GRID)
@@ -139,7 +139,7 @@ def _plan(
     lap = slice(-1 if closed else None)
     # A coarse node takes the lowest cap around it, so that no cap is lost between nodes.
     reach = int(np.ceil(0.5 * length / cells / spacing))
-    nodes = np.rint(coarse[lap] / spacing).astype(int).clip(0, len(caps) - 1)
+    nodes = np.rint(coarse[lap] / spacing).astype(int) % len(caps[lap])
     lowest, bent = (
         np.lib.stride_tricks.sliding_window_view(
             np.pad(values[lap], reach, mode="wrap" if closed else "edge"), 2 * reach + 1
@@ -188,11 +188,12 @@ def _excess(
     *,
     closed: bool,
 ) -> tuple[Array, Array]:
-    """Measure a profile at the path's own nodes: shares of limits that are used, each (n,).
+    """Measure which shares of the limits a profile uses at the path's own nodes, two of (n,).
 
-    The first are of the squared speed and of all that grows with it: lateral acceleration, steering
-    rate, and both accelerations together, or of `min_speed` where that is more. The second are of
-    the jerk.
+    The first is the largest share of all that grows with the squared speed: lateral acceleration,
+    the square of the steering rate, and both accelerations together. It is at most that by which
+    the squared speed exceeds that of `min_speed`, to which alone it may be lowered. The second is
+    the share of the jerk.
     """
     ends = slice(-2, -1) if closed else slice(1), slice(1, 2) if closed else slice(-1, None)
     v, kappa = (np.concatenate([u[ends[0]], u, u[ends[1]]]) for u in (speed, curvature))
@@ -215,18 +216,18 @@ def _excess(
 
 
 def _larger(cells: Array) -> Array:
-    """Return the larger of the values in the two cells beside each node."""
+    """Return the larger value of the two cells beside each node."""
     return np.maximum(cells[1:], cells[:-1])
 
 
 def keep_speed(
     speed: Array, curvature: Array, spacing: float, limits: SpeedLimits, *, closed: bool = False
 ) -> Array:
-    """Return the highest speeds (n,), m/s, up to given ones that keep to limits, without jerk.
+    """Lower speeds (n,), m/s, to the highest ones that keep to limits, but for that of the jerk.
 
     Given speeds are kept wherever top speed, lateral acceleration, steering rate and both
-    longitudinal accelerations allow them. The result is never below `MINIMUM_SPEED`, which
-    is also what a stop becomes.
+    longitudinal accelerations allow them. The result is never below `MINIMUM_SPEED`, to which
+    stops are raised.
 
     Parameters
     ----------
@@ -269,5 +270,5 @@ def constant_speed(path: ReferencePath) -> float:
     if "limits" not in path.metadata:
         return float(path.speed.min())
     limits = SpeedLimits(**path.metadata["limits"])
-    caps = speed_caps(path.curvature, path.spacing, limits)
+    caps = speed_caps(path.curvature, path.spacing, limits, closed=path.closed)
     return max(float(caps.min()), limits.end_speed)

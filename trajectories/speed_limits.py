@@ -14,7 +14,7 @@ CORNER = Number(-1e6, 1e6)
 COMFORTABLE_SPEED = 10.0
 """m/s: top speed of a planned profile unless one is given."""
 CREEPING_SPEED = 0.25
-"""m/s: speed to which the kinks of a file slow a planned profile down at most."""
+"""Lowest speed to which the kinks of a file slow a planned profile down, m/s."""
 ACCELERATION_SHARE, JERK_SHARE = 0.75, 0.2
 """Shares of a vehicle's longitudinal acceleration and jerk that a comfortable profile uses: 1.5 of
 the paper's 2 m/s^2, and 1 of 5 m/s^3."""

@@ -17,6 +17,7 @@ from lpv_track_env.bicycle import PSI, VX, VY, YAW_RATE, X, Y
 from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories import ReferencePath
+from trajectories.smoothing import chord_lengths
 
 Array = NDArray[np.float64]
 
@@ -150,7 +151,7 @@ def _lap(
 
 def _places(path: ReferencePath, motion: Motion) -> list[tuple[float, float, float]]:
     """Return the positions of a motion, and about how far along the path they are."""
-    shares = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(motion.state[:, [X, Y]].T)))])
+    shares = chord_lengths(motion.state[:, [X, Y]])
     along = path.length * shares / shares[-1]
     along[-1] = path.length - 1e-9
     return [(x, y, s) for (x, y), s in zip(motion.state[:, [X, Y]].tolist(), along, strict=True)]

@@ -20,7 +20,7 @@ from experiments.ros.topics import Datum, Fixes, GeoPoint, Odometry
 from trajectories.oddities import oddities
 from trajectories.path import ReferencePath
 from trajectories.shapes import Geometry, from_geometry, smooth
-from trajectories.smoothing import largest_penalty
+from trajectories.smoothing import chord_lengths, largest_penalty
 from trajectories.speed import SpeedLimits
 
 Array = NDArray[np.float64]
@@ -263,7 +263,7 @@ def _recorded_speed(
 ) -> Array:
     """Return the speed (n,), m/s, on the path's grid from points (m, 2) passed at times (m,)."""
     speed = np.hypot(*(spline.derivative()(at) for spline in splines))
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(chain, axis=0).T))])
+    along = chord_lengths(chain)
     along *= geometry.arc_length[-1] / along[-1]  # chords are shorter than arcs
     interpolated: Array = np.interp(geometry.arc_length, along, np.maximum(speed, LEAST_SPEED))
     return interpolated

@@ -166,7 +166,7 @@ def test_a_plan_follows_the_vehicle(tmp_path: Path) -> None:
 def test_speeds_in_kmh_are_suspected_by_the_times(tmp_path: Path) -> None:
     latitude = 48.0 + X * 5.0 / 111_200.0  # 5 m/s in steps of 1 s
     columns = (X, latitude, 11.0)
-    with pytest.warns(UserWarning, match=r"3\.6 times .* say so by speed_unit"):
+    with pytest.warns(UserWarning, match=r"3\.6 times .* give speed_unit='km/h'"):
         load(table(tmp_path, "t,lat,lon,speed", *columns, 18.0))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

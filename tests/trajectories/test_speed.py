@@ -224,8 +224,9 @@ def test_a_long_lap_is_planned_at_once_and_only_once(monkeypatch: pytest.MonkeyP
     np.testing.assert_array_equal(plan_speed(curvature, SPACING, limits, closed=True), speed)
 
 
-def test_circle_is_driven_at_its_lateral_limit() -> None:
-    speed = plan_speed(np.full(800, 1 / 30.0), 0.25, LIMITS, closed=True)
+@pytest.mark.parametrize("nodes", [4, 5, 800])
+def test_circle_is_driven_at_its_lateral_limit(nodes: int) -> None:
+    speed = plan_speed(np.full(nodes, 1 / 30.0), 0.25, LIMITS, closed=True)
     np.testing.assert_allclose(speed, math.sqrt(2.0 * 30.0), rtol=1e-9)
 
 
