@@ -31,15 +31,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--speeds", type=number(1.5, 100.0, "m/s"), nargs=2, default=[6.0, 14.0],
-        metavar=("LOW", "HIGH"), help="mean speed, m/s (default 6 14)",
+        metavar=("LOW", "HIGH"), help="range of the mean speed, m/s (default 6 14)",
     )  # fmt: skip
     parser.add_argument(
         "--lateral-acceleration", type=number(0.1, 15.0, "m/s^2"), default=2.5, metavar="A",
-        help="about the largest, m/s^2 (default 2.5)",
+        help="lateral acceleration that is rarely exceeded, m/s^2 (default 2.5)",
     )  # fmt: skip
     parser.add_argument(
         "--noise", type=number(0.0, 100.0), default=1.0, metavar="FACTOR",
-        help="of the sensors' noise: 0.03 m, 0.03 m/s (vy 0.05), 0.005 rad, 0.005 rad/s",
+        help="factor on the sensors' noise of 0.03 m, 0.03 m/s (vy 0.05), 0.005 rad, 0.005 rad/s "
+        "(default 1)",
     )  # fmt: skip
     add_control_period(parser, 0.02)
     add_seed(parser)

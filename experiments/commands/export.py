@@ -59,7 +59,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     model = model_of(policy, task)
     found = difference(policy, task, model)
     if not found < TOLERANCE:
-        raise ValueError(f"the model differs from the agent by {found:g}: this is a fault of ours")
+        raise ValueError(f"the model differs from the agent by {found:g}: please report it")
     write_atomically(options.out, model.SerializeToString())
     console.out(
         f"{options.out}: observation (n, {policy.layout.size}) -> action (n, 2) for "

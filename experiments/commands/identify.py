@@ -38,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     for kind in TOPICS:
         parser.add_argument(
-            f"--{kind}-topic", metavar="TOPIC", help="required if the bag has several"
+            f"--{kind}-topic", metavar="TOPIC", help="required if a bag has several"
         )
 
 

@@ -25,6 +25,7 @@ NOISE: Mapping[str, float] = {
 """Standard deviations of the sensors: m/s, m/s, rad, rad/s, m, m; those of a good inertial
 navigation system with corrected satellite positions."""
 TONES = 8
+"""Number of sines for each command."""
 STEERING_BAND, DRIVE_BAND = (0.1, 1.6), (0.05, 0.7)
 """Hz, of the tones that are added."""
 RETURN_TIME = 3.0
@@ -63,9 +64,9 @@ class Exciter:
         ]
         self._last = np.zeros(2)
 
-    def _tone(self, column: int, time: float) -> float:
-        """Return the sum of a column's tones; it is rarely beyond 1."""
-        frequencies, phases = self._tones[column]
+    def _tone(self, command: int, time: float) -> float:
+        """Return the sum of a command's tones, which rarely exceeds 1."""
+        frequencies, phases = self._tones[command]
         sines = np.sin(2.0 * math.pi * frequencies * time + phases)
         return float(np.sum(sines)) / (2.0 * math.sqrt(0.5 * TONES))
 

@@ -36,9 +36,9 @@ ROUNDS = 40
 SETTLED = 1e-3
 """Change of every parameter, by its deviation, at which the steps end."""
 SHORTEST_SHARE = 1e-4
-"""Share of a step below which no shorter one is tried."""
+"""Smallest share of a Gauss-Newton step that is tried."""
 NEGLIGIBLE = 0.02
-"""Decrease of half the weighted squares that is worth no further step."""
+"""Decrease of the cost that is worth no further step."""
 LARGEST_STEP = 0.5
 """Largest change of a logarithm in a step, and of another parameter in its unit."""
 HUBER = 4.0
@@ -48,12 +48,12 @@ LEAST_NOISE = 1e-9
 RANK = 1e-9
 """Singular values of a window's initial state below this share of the largest count as none."""
 GUESSED: Mapping[int, float] = {FRONT: 0.5, REAR: 0.5, RATIO: 0.5}
-"""Parameters of which the nominal vehicle is a guess, and its deviation, relative: what the logs
-do not tell stays near it, and what they tell in combination alone is divided evenly."""
+"""Parameters that the nominal vehicle guesses, and the guess's relative deviation: those that the
+logs do not tell stay near it, and a change that they tell in combination alone is shared evenly."""
 READ_WITH: Mapping[str, tuple[int, float, int | None]] = {
     "yaw_rate": (BIAS, 1.0, None), "vy": (SIDESLIP, 1.0, VX), "heading": (SIDESLIP, -1.0, None),
 }  # fmt: skip
-"""Sensors' offsets: the parameter, and its factor: a sign, or a state."""
+"""Offsets of the sensors by channel: the parameter, its sign, and the state that multiplies it."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class WindowFit:
     def residuals(self, initial: Array, parameters: Array) -> list[dict[str, tuple[Array, Array]]]:
         """Return, for each window and channel, residuals and their derivatives (n, `BLOCK`)."""
         states, sensitivities = self.predictor.predict(initial, parameters)
-        # Too long a trial step may not stay finite, which its cost tells.
+        # A trial step that is too long may not stay finite; the cost is inf then.
         sensitivities = np.nan_to_num(sensitivities, nan=0.0, posinf=0.0, neginf=0.0, copy=False)
         found = []
         for k, window in enumerate(self.predictor.windows):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from experiments.identification.model import (
     SIDESLIP,
     STEERING_DEAD,
     STEERING_LAG,
+    UNITS,
     Predictor,
     Windows,
     nominal_parameters,
@@ -58,9 +59,8 @@ WORST: Mapping[int, float] = {
     DRIVE_LAG: 0.1, DRIVE_DEAD: 0.1, STEERING_LAG: 0.05, STEERING_DEAD: 0.05,
 }  # fmt: skip
 """Largest deviation of each parameter that is identified: relative, then m/s^2, rad, rad/s, s."""
-UNITS: Mapping[int, str] = {ROLLING: "m/s^2", OFFSET: "rad", BIAS: "rad/s", SIDESLIP: "rad"}
 DISTINCT = 2.0
-"""Deviations from none at which a lag and a dead time of the same actuator count as distinct."""
+"""Standard deviations from 0 at which lag and dead time of the same actuator count as distinct."""
 WORDS: Mapping[int, tuple[str, str]] = {
     FRONT: ("front cornering stiffness", "steer in bends and quickly"),
     REAR: ("rear cornering stiffness", "steer in bends and quickly"),
@@ -75,7 +75,7 @@ WORDS: Mapping[int, tuple[str, str]] = {
     STEERING_LAG: ("lag of the steering", "steer quickly"),
     STEERING_DEAD: ("dead time of the steering", "steer quickly"),
 }
-"""Each parameter in words, and how to drive for a log that tells it."""
+"""Each parameter in words, and the way to drive for a log that tells it."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +117,8 @@ class Identification:
         Numbers of windows: fitted, checked, too slow, beyond the tyres' linear range.
     checks
         Predictions of the nominal and of the identified vehicle.
+    conditions
+        Fields of `lpv_track_env.conditions` for the identified actuators.
     """
 
     nominal: VehicleParameters
@@ -127,8 +129,7 @@ class Identification:
     excitation: dict[str, float]
     windows: dict[str, int]
     checks: dict[str, Check]
-    conditions: dict[str, float] = field(default_factory=dict)
-    """Fields of `lpv_track_env.conditions` for the identified actuators."""
+    conditions: dict[str, float]
 
 
 Progress = Callable[[str], None]
@@ -344,7 +345,7 @@ def _steps(progress: Progress, words: str) -> Callable[[int], None]:
 
 
 def _indistinct(fit: Fit, free: set[int]) -> int | None:
-    """Return the lag or dead time that is less distinct from none, if a pair is not told apart."""
+    """Return of an actuator's lag and dead time the one nearer to 0, if they are not told apart."""
     for pair in ((DRIVE_LAG, DRIVE_DEAD), (STEERING_LAG, STEERING_DEAD)):
         if free.issuperset(pair):
             sigmas = [float(fit.parameters[k] / max(fit.deviations[k], 1e-12)) for k in pair]
@@ -356,7 +357,7 @@ def _indistinct(fit: Fit, free: set[int]) -> int | None:
 def _not_told(place: int, deviation: float) -> str:
     """Return the remark on a parameter that is too uncertain."""
     word, advice = WORDS[place]
-    size = f"{min(deviation, 99.0):.2g} {UNITS.get(place, 's')}"
+    size = f"{min(deviation, 99.0):.2g} {UNITS[place]}"
     if place in SCALED:
         size = f"{100.0 * min(deviation, 9.99):.0f} %"
     kept = "leans on the nominal value" if place in GUESSED else "the nominal value is kept"
@@ -366,7 +367,7 @@ def _not_told(place: int, deviation: float) -> str:
 def _vehicle(
     fit: Fit, nominal: VehicleParameters, name: str, logs: Sequence[Log]
 ) -> tuple[VehicleParameters, list[str]]:
-    """Return the identified vehicle, and notes on what it cannot hold."""
+    """Return the identified vehicle, and notes on results that a vehicle's file cannot hold."""
     p, notes = fit.parameters, []
     rolling = float(p[ROLLING]) / GRAVITY
     if rolling < 0.0:

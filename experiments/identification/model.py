@@ -6,7 +6,7 @@ integrated by classic Runge-Kutta steps from reading to reading; its sensitiviti
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -34,7 +34,12 @@ vehicle's; the rest s."""
 ) = range(len(PARAMETERS))  # fmt: skip
 COUNT = len(PARAMETERS)
 SCALED = (FRONT, REAR, RATIO, GAIN)
-"""Parameters whose logarithm is fitted."""
+"""Parameters whose logarithm is fitted; their deviations are relative."""
+UNITS: Mapping[int, str] = {
+    FRONT: "N/(rad kg)", REAR: "N/(rad kg)", RATIO: "", ROLLING: "m/s^2", GAIN: "", OFFSET: "rad",
+    BIAS: "rad/s", SIDESLIP: "rad", DRIVE_LAG: "s", DRIVE_DEAD: "s", STEERING_LAG: "s",
+    STEERING_DEAD: "s",
+}  # fmt: skip
 SHORTEST_LAG, LONGEST_LAG, LONGEST_DEAD = 1e-6, 1.0, 1.0
 """Bounds of lags and dead times, s; the shortest lag counts as none."""
 LOWER, UPPER = np.full(COUNT, -np.inf), np.full(COUNT, np.inf)
@@ -58,7 +63,7 @@ def nominal_parameters(vehicle: VehicleParameters) -> Array:
 
 @dataclass(frozen=True)
 class _PerMass:
-    """Stand-in for `VehicleParameters` of mass 1 whose numbers are CasADi symbols."""
+    """Stand-in for the `VehicleParameters` of a mass of 1 kg, with CasADi symbols for numbers."""
 
     lf: float
     lr: float
@@ -115,7 +120,7 @@ class Actuators:
     """Outputs of the actuators, averaged over the steps of a grid, with their derivatives.
 
     As in `conditions.vehicle`: a command counts from its time plus the dead time on, a first-order
-    lag follows, and both are exact for commands that are held.
+    lag follows. Steps within which the command changes count with its mean.
     """
 
     def __init__(self, log: Log, nodes: Array) -> None:

@@ -1,4 +1,4 @@
-"""Motion as a log's readings tell it, for first guesses, and checks of units and signs."""
+"""Motion from a log's readings: for first guesses, and for checks of units and signs."""
 
 import math
 
@@ -10,9 +10,9 @@ from experiments.identification.log import Log
 Array = NDArray[np.float64]
 
 AGREEING = (0.5, 2.0)
-"""Ratios between two readings of the same quantity that are not mistaken units."""
+"""Ratios of two readings of the same quantity within which units are taken for right."""
 LEAST = 0.3
-"""Correlation from which on two readings are compared."""
+"""Least correlation at which two readings are compared."""
 
 
 def smooth_rate(times: Array, values: Array, at: Array) -> Array:
@@ -23,7 +23,7 @@ def smooth_rate(times: Array, values: Array, at: Array) -> Array:
 
 
 def speed(log: Log, at: Array) -> Array:
-    """Return the speed, or in its place that of the positions, m/s."""
+    """Return the speed, without such readings that of the positions, m/s."""
     if "vx" in log.readings:
         return np.interp(at, *log.readings["vx"])
     rates = [smooth_rate(*log.readings[name], at) for name in ("x", "y")]
@@ -31,7 +31,7 @@ def speed(log: Log, at: Array) -> Array:
 
 
 def heading(log: Log, at: Array) -> Array:
-    """Return the heading, or in its place the course over ground, rad."""
+    """Return the heading, without such readings the course over ground, rad."""
     if "heading" in log.readings:
         return np.interp(at, *log.readings["heading"])
     if "x" not in log.readings:
@@ -70,10 +70,11 @@ def check(log: Log) -> None:
     pairs = []
     if "yaw_rate" in log.readings and "heading" in log.readings:
         other = smooth_rate(*log.readings["heading"], at)
-        pairs.append(("heading changes", "yaw_rate says; both in rad", other, turning(log, at)))
+        words = ("heading changes", "yaw_rate says: are both in rad")
+        pairs.append((*words, other, turning(log, at)))
     if "vx" in log.readings and "x" in log.readings:
         rates = [smooth_rate(*log.readings[name], at) for name in ("x", "y")]
-        words = ("positions move", "vx says; m and m/s")
+        words = ("positions move", "vx says: are they in m and m/s")
         pairs.append((*words, np.hypot(*rates), speed(log, at)))
     for what, than, one, other in pairs:
         ratio = float(np.sqrt(np.mean(one**2)) / max(np.sqrt(np.mean(other**2)), 1e-9))

@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from experiments.identification.identify import Check, Identification
-from experiments.identification.model import COUNT, FRONT, GAIN, PARAMETERS, RATIO, REAR
+from experiments.identification.model import (
+    COUNT,
+    PARAMETERS,
+    SCALED,
+    SHORTEST_LAG,
+    UNITS,
+    nominal_parameters,
+)
 from trajectories.fileio import write_atomically
 
 if TYPE_CHECKING:
@@ -20,12 +27,6 @@ DRAWN = (
 CHANNEL_UNITS = {
     "vx": "m/s", "vy": "m/s", "heading": "rad", "yaw_rate": "rad/s", "x": "m", "y": "m",
 }  # fmt: skip
-UNITS = {
-    "front_stiffness": "N/(rad kg)", "rear_stiffness": "N/(rad kg)", "inertia_ratio": "",
-    "rolling_deceleration": "m/s^2", "drive_gain": "", "steering_offset": "rad",
-    "yaw_rate_bias": "rad/s", "sideslip_offset": "rad",
-}  # fmt: skip
-RELATIVE = (FRONT, REAR, RATIO, GAIN)
 
 
 def parameters_of(found: Identification) -> dict[str, dict[str, Any]]:
@@ -34,12 +35,12 @@ def parameters_of(found: Identification) -> dict[str, dict[str, Any]]:
     for place in range(COUNT):
         value = float(found.fit.parameters[place])
         deviation = float(found.fit.deviations[place])
-        if place in RELATIVE:
+        if place in SCALED:
             deviation *= value
         rows[PARAMETERS[place]] = {
             "value": value,
             "deviation": deviation if math.isfinite(deviation) else None,
-            "unit": UNITS.get(PARAMETERS[place], "s"),
+            "unit": UNITS[place],
         }
     return rows
 
@@ -122,26 +123,16 @@ def table(found: Identification) -> "Table":
     """Return the console's table of parameters."""
     from rich.table import Table
 
-    nominal = {
-        "front_stiffness": found.nominal.front_cornering_stiffness / found.nominal.mass,
-        "rear_stiffness": found.nominal.rear_cornering_stiffness / found.nominal.mass,
-        "inertia_ratio": found.nominal.yaw_inertia
-        / (
-            found.nominal.mass
-            * found.nominal.front_axle_distance
-            * found.nominal.rear_axle_distance
-        ),
-        "rolling_deceleration": found.nominal.rolling_deceleration,
-        "drive_gain": 1.0,
-    }
+    nominal = nominal_parameters(found.nominal)
+    nominal[nominal <= SHORTEST_LAG] = 0.0
     shown = Table("parameter", "unit", title="Parameters, per mass", title_justify="left")
     for heading in ("nominal", "identified", "1 sigma"):
         shown.add_column(heading, justify="right", no_wrap=True)
-    for name, row in parameters_of(found).items():
+    for (name, row), before in zip(parameters_of(found).items(), nominal, strict=True):
         deviation = row["deviation"]
         shown.add_row(
-            name, row["unit"], f"{nominal.get(name, 0.0):.4g}",
-            f"{row['value']:.4g}", "held" if deviation is None else f"{deviation:.2g}",
+            name, row["unit"], f"{before:.4g}", f"{row['value']:.4g}",
+            "held" if deviation is None else f"{deviation:.2g}",
         )  # fmt: skip
     return shown
 

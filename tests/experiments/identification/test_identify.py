@@ -321,11 +321,11 @@ def test_hostile_logs_are_refused_in_one_line(
         (
             ["yaw_rate"],
             57.3,
-            "heading changes 0.01[78].* as fast as yaw_rate says; both in rad",
+            "heading changes 0.01[78].* as fast as yaw_rate says: are both in rad",
         ),
         (["heading"], 57.3, "heading changes 5[789].* times as fast"),
         (["heading"], -1.0, "heading changes -1.* times as fast"),
-        (["vx"], 3.6, "positions move 0.278 times as fast as vx says; m and m/s"),
+        (["vx"], 3.6, "positions move 0.278 times as fast as vx says: are they in m and m/s"),
         (["yaw_rate", "heading"], -1.0, "turns right where the steering is positive"),
     ],
 )
