@@ -344,19 +344,11 @@ class DelayCompensated:
         Its task.
     actuation
         Delays and lags, s.
-    model
-        Vehicle model of the prediction; by default the task's vehicle.
     """
 
-    def __init__(
-        self,
-        agent: Agent,
-        task: DrivingTask,
-        actuation: Actuation,
-        model: VehicleParameters | None = None,
-    ) -> None:
+    def __init__(self, agent: Agent, task: DrivingTask, actuation: Actuation) -> None:
         self.agent, self.task, self.actuation = agent, task, actuation
-        self.future = NearFuture(task, actuation, model)
+        self.future = NearFuture(task, actuation)
         self._memory: DelayMemory | None = None
         self._blank = self.future.memory(0)
 

@@ -2,7 +2,8 @@
 
 Agents take observations and give actions in SI units. A wrapper that rescales, normalises or stacks
 them would make an agent drive off the road without a word, so only those pass that are known to
-hand on both unchanged. Any other wrapper may say so of itself: `passes_through = True`.
+hand on both unchanged, and `RescaleAction`, which is undone. Any other wrapper may say so of
+itself: `passes_through = True`.
 """
 
 from collections.abc import Sequence
@@ -39,12 +40,15 @@ HARMLESS = {
 keep.
 """
 STEPS = (0.0, *(sign * 2.0**power for power in range(-5, 3) for sign in (-1.0, 1.0)))
+"""Neighbours of an action that are tried, in units of the last place."""
 CHANGING = ("step", "reset", "observation", "action")
 """Methods by which a wrapper changes what it hands on."""
 
 
 def beneath(env: Env) -> tuple[Env, list[Rescaling]]:
-    """Return the tracking environment beneath wrappers, and those to be undone, from inside.
+    """Return the tracking environment beneath wrappers, and the wrappers to be undone.
+
+    The latter are listed from the inside outwards.
 
     An environment, or a wrapper such as `lpv_track_env.highway.wrapper.HighwayTracking`, is one for
     tracking if it has a `layout` of its own.
@@ -97,12 +101,12 @@ def passes(layer: Layer) -> bool:
 
 
 def _keeps(layer: Layer, known: type[Any]) -> bool:
-    """Tell whether a wrapper of a subclass works as those of the known class."""
+    """Tell whether a wrapper has all methods of `CHANGING` from the known class."""
     return all(getattr(type(layer), name, None) is getattr(known, name, None) for name in CHANGING)
 
 
 def rescaled(layers: Sequence[Rescaling], action: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the action (..., 2) that wrappers, listed from inside, turn into `action`.
+    """Return the action (..., 2) that wrappers, listed from the inside, turn into `action`.
 
     The wrappers compute in the precision of what they are given, here float64, with which they
     reach every float32 to the last bit, except next to a zero that they shift.
@@ -122,8 +126,8 @@ def rescaled(layers: Sequence[Rescaling], action: NDArray[Any]) -> NDArray[np.fl
         if np.isfinite(span).all():  # else the wrapper leaves unbounded actions as they are
             factor = (outer.high - outer.low) / span
             given, scale = outer.low + (given - low) * factor, scale * factor
-    # The wrappers' own factors are rounded to float32: residuals lead to the exact action, and at
-    # last its neighbours are tried.
+    # The wrappers' own factors are rounded to float32: corrections by the residual come close to
+    # the exact action, and the best of its neighbours is taken.
     for _ in range(3):
         given = given + (wanted - reached(given)) * scale
     units = np.spacing(given), np.spacing(scale)

@@ -33,7 +33,7 @@ GIVEN = ("arc_length", "lateral_error", "heading_error", "speed_error", "speed")
 
 
 class End(IntEnum):
-    """How an episode ended, in infos: a number that equals its name, `info["end"] == "finished"`.
+    """End of an episode, in infos: a number that equals its name, `info["end"] == "finished"`.
 
     RL libraries gather infos in arrays of numbers and refuse texts. While the episode runs it is 0
     and equals "". Its text is its name, as its hash is: sets of names contain it.

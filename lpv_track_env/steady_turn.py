@@ -24,7 +24,7 @@ from lpv_track_env.plausibility import GRAVITY
 from trajectories.compilation import compiled_internal
 
 MOST_RATIO = 0.75
-"""Largest (kappa b)^2: a sideslip of 60 degrees."""
+"""Largest (kappa b)^2, the squared sine of the sideslip: 60 degrees."""
 MOST_GRIP = 0.95
 """Largest share z: a turn that needs more is not steady."""
 
@@ -67,7 +67,7 @@ compiled_steady_turn = compiled_internal(steady_turn)
 
 @compiled_internal
 def softened(curvature: Any, speed: Any, friction: Any) -> Any:
-    """Return the share of the cornering stiffness that is left in a turn, 1 on linear tyres."""
+    """Return the share of the cornering stiffness that a turn leaves, 1 on linear tyres (inf)."""
     z = min(abs(curvature) * speed * speed / (friction * GRAVITY), MOST_GRIP)
     if z < 1e-6:
         return 1.0
@@ -84,9 +84,11 @@ def turn_steadily(
 ) -> tuple[Any, Any]:
     """Set the lateral motion of a record's state, whose vx is set, to that of a steady turn.
 
-    The heading turns inwards by the sideslip, so that the vehicle moves along its former direction.
+    The heading turns back by the sideslip, so that the vehicle moves along its former direction.
+    `constants` are those of `kernels`, `friction` and `max_steering` as in `episodes.begin`.
 
-    Returns the steering angle (rad), and the acceleration (m/s^2) by which the turn slows it down.
+    Returns the steering angle (rad), and the acceleration (m/s^2) that makes up for what the turn
+    takes from the speed.
     """
     speed, mass, lf, lr = record[VX], constants[0], constants[2], constants[3]
     if friction < math.inf and abs(curvature) * speed * speed > MOST_GRIP * friction * GRAVITY:

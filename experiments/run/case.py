@@ -187,7 +187,7 @@ class Case(BaseCase):
 
     @property
     def reset_options(self) -> dict[str, Any]:
-        """Where the vehicle starts."""
+        """Start of the vehicle."""
         return dict(self.start)
 
     @property
