@@ -25,6 +25,7 @@ from agents.reference import (
     NODE_Y,
     fill_nodes,
 )
+from agents.wrappers import AgentAround
 from lpv_track_env import observation as entry
 from lpv_track_env import tyres
 from lpv_track_env.bicycle import longest_substep
@@ -333,7 +334,7 @@ class NearFuture:
             memory.commands[:, 0] = actions
 
 
-class DelayCompensated:
+class DelayCompensated(AgentAround):
     """Any agent with delay compensation: it acts on predicted observations, see `NearFuture`.
 
     Parameters
@@ -347,15 +348,11 @@ class DelayCompensated:
     """
 
     def __init__(self, agent: Agent, task: DrivingTask, actuation: Actuation) -> None:
-        self.agent, self.task, self.actuation = agent, task, actuation
+        super().__init__(agent)
+        self.task, self.actuation = task, actuation
         self.future = NearFuture(task, actuation)
         self._memory: DelayMemory | None = None
         self._blank = self.future.memory(0)
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "agent":
-            raise AttributeError(name)
-        return getattr(self.agent, name)
 
     def reset(self) -> None:
         """Clear the memory: the next call begins new episodes."""

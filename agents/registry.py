@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import CHECKPOINTS, Action, Agent, DrivingTask
-from agents.wrappers import RescaledAgent, beneath
+from agents.wrappers import AgentAround, RescaledAgent, beneath
 from lpv_track_env.vehicle import VehicleParameters
 from lpv_track_env.vehicle import load as load_vehicle
 from trajectories.arguments import flag, instance_of, shortened, shown
@@ -210,7 +210,7 @@ def make(
     return RescaledAgent(agent, rescaling) if rescaling else agent
 
 
-class TrackingPartAgent:
+class TrackingPartAgent(AgentAround):
     """Agent in an environment whose observation is longer than the tracking observation.
 
     It hands on the tracking part (`ObservationLayout.tracking_part`) of each observation.
@@ -223,13 +223,11 @@ class TrackingPartAgent:
         Task with the layout of the tracking observation.
     """
 
-    def __init__(self, agent: Agent, task: DrivingTask) -> None:
-        self.agent, self.task = agent, task
+    agent: Agent
 
-    def __getattr__(self, name: str) -> Any:
-        if name == "agent":  # not yet there while a copy or a pickle is made
-            raise AttributeError(name)
-        return getattr(self.agent, name)
+    def __init__(self, agent: Agent, task: DrivingTask) -> None:
+        super().__init__(agent)
+        self.task = task
 
     def predict(
         self,

@@ -137,7 +137,19 @@ def rescaled(layers: Sequence[Rescaling], action: NDArray[Any]) -> NDArray[np.fl
     return chosen
 
 
-class RescaledAgent:
+class AgentAround:
+    """Agent around another one, whose attributes it has besides its own."""
+
+    def __init__(self, agent: Any) -> None:
+        self.agent = agent
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "agent":  # not yet there while a copy or a pickle is made
+            raise AttributeError(name)
+        return getattr(self.agent, name)
+
+
+class RescaledAgent(AgentAround):
     """Agent behind `RescaleAction` wrappers: it gives its actions in their units.
 
     Parameters
@@ -149,12 +161,8 @@ class RescaledAgent:
     """
 
     def __init__(self, agent: Any, layers: Sequence[Rescaling]) -> None:
-        self.agent, self.layers = agent, layers
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "agent":  # not yet there while a copy or a pickle is made
-            raise AttributeError(name)
-        return getattr(self.agent, name)
+        super().__init__(agent)
+        self.layers = layers
 
     def predict(
         self,

@@ -88,7 +88,7 @@ class ControlProblem:
         number of Runge-Kutta steps in each.
     periodic
         True: the inputs before the first interval are those of the last. Otherwise they are those
-        of an environment's start: steering straight, acceleration that holds the speed.
+        of an environment's start on a straight: no steering, acceleration that holds the speed.
     """
 
     def __init__(

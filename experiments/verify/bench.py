@@ -126,7 +126,7 @@ class Sampler:
         return max(least, car.longitudinal_acceleration_range[0])
 
     def _move(self, entries: dict[str, slice], observation: Any, rng: np.random.Generator) -> None:
-        """Give the vehicle a turning motion, since a reset leaves it going and steering straight.
+        """Give the vehicle another motion than the steady turn in which a reset leaves it.
 
         In half of the cases it turns about as the path does, else its steering angle is anywhere
         within its range.
