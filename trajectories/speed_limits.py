@@ -18,6 +18,8 @@ CREEPING_SPEED = 0.25
 ACCELERATION_SHARE, JERK_SHARE = 0.75, 0.2
 """Shares of a vehicle's longitudinal acceleration and jerk that a comfortable profile uses: 1.5 of
 the paper's 2 m/s^2, and 1 of 5 m/s^3."""
+BRAKING_SHARE = 0.95
+"""Deceleration by acceleration where none is given: the paper's tables have one row for both."""
 UNLIMITED = 1e6
 """m/s^2: an acceleration that limits nothing."""
 
@@ -60,8 +62,7 @@ class SpeedLimits:
     max_speed
         m/s.
     max_lateral_acceleration, max_acceleration, max_deceleration
-        m/s^2; the deceleration is by default 95 % of the acceleration, since the paper's tables
-        have one row for both.
+        m/s^2; the deceleration is by default 95 % of the acceleration.
     max_jerk
         m/s^3.
     max_steering_rate
@@ -119,12 +120,17 @@ class SpeedLimits:
         """Return the limits of a comfortable profile for a vehicle.
 
         They are its lateral acceleration, steering rate and wheelbase, `ACCELERATION_SHARE` of its
-        acceleration, `JERK_SHARE` of its jerk, and `COMFORTABLE_SPEED` if it drives that fast.
+        acceleration (and of its braking, if that is weaker), `JERK_SHARE` of its jerk, and
+        `COMFORTABLE_SPEED` if it drives that fast.
         """
+        slowest, fastest = vehicle.longitudinal_acceleration_range
+        acceleration, braking = ACCELERATION_SHARE * fastest, -ACCELERATION_SHARE * slowest
+        weak = LIMIT.low <= braking < BRAKING_SHARE * acceleration
         return cls(
             max_speed=min(COMFORTABLE_SPEED, vehicle.speed_range[1]),
             max_lateral_acceleration=vehicle.max_lateral_acceleration,
-            max_acceleration=ACCELERATION_SHARE * vehicle.longitudinal_acceleration_range[1],
+            max_acceleration=acceleration,
+            max_deceleration=braking if weak else None,
             max_jerk=JERK_SHARE * vehicle.max_jerk,
             max_steering_rate=vehicle.max_steering_rate,
             wheelbase=vehicle.wheelbase,
@@ -152,7 +158,7 @@ class SpeedLimits:
 
     @property
     def deceleration(self) -> float:
-        """Bound on deceleration, m/s^2: 95 % of `max_acceleration` unless given."""
+        """Bound on deceleration, m/s^2: `BRAKING_SHARE` of `max_acceleration` unless given."""
         if self.max_deceleration is None:
-            return 0.95 * self.max_acceleration
+            return BRAKING_SHARE * self.max_acceleration
         return self.max_deceleration

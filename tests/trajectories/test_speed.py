@@ -444,3 +444,6 @@ class TestKeepSpeed:
         assert (planned.max_speed, planned.max_acceleration, planned.max_jerk) == (8.0, 3.0, 10.0)
         assert (planned.max_lateral_acceleration, planned.wheelbase) == (5.0, 0.33)
         assert (hardest.max_acceleration, hardest.deceleration) == (4.0, 6.0)
+        assert planned.deceleration == pytest.approx(0.95 * 3.0)
+        car.longitudinal_acceleration_range = (-2.0, 4.0)
+        assert SpeedLimits.of(car).deceleration == pytest.approx(0.75 * 2.0)
