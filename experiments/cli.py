@@ -134,7 +134,7 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _imports_said(console: "Console") -> Iterator[None]:
-    """Print what this process's imports of paths from files say of themselves, each line once."""
+    """Print the line about each path that this process imports from a file, each line once."""
     from trajectories.arguments import shortened
 
     process, said = os.getpid(), set()
@@ -159,7 +159,7 @@ def _imports_said(console: "Console") -> Iterator[None]:
 
 @contextmanager
 def _warnings_in_lines() -> Iterator[None]:
-    """Print a user's warnings as lines, each once; others keep their place in the sources."""
+    """Print warnings for users as one line each, once; others with their place in the sources."""
     said: set[str] = set()
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:

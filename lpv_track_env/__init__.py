@@ -25,7 +25,7 @@ COMPILED_LIBRARY = True
 
 
 def _check_neighbours() -> None:
-    """Tell of a folder or file beside the user's script that hides a package of this project.
+    """Report a folder or file beside the user's script that hides a package of this project.
 
     Python finds it first, with or without an `__init__.py`. The environments need `trajectories`;
     a user who needs no agents may have an `agents` of their own.

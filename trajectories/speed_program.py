@@ -51,7 +51,7 @@ def smoothed_at(values: Array, at: Array, *, closed: bool) -> Array:
 
 
 def _spline(at: Array, count: int) -> tuple[NDArray[np.intp], tuple[Array, Array, Array]]:
-    """Return the nearest of so many nodes and the weights of it and its neighbours, each (n,)."""
+    """Return the nearest of `count` nodes and the weights of it and its neighbours, each (n,)."""
     node = np.rint(at).astype(int).clip(0, count - 1)
     u = at - node
     return node, (0.5 * (0.5 - u) ** 2, 0.75 - u * u, 0.5 * (0.5 + u) ** 2)

@@ -106,7 +106,7 @@ class Identification:
     nominal, vehicle
         The vehicle that was given, and the identified one.
     fit
-        Parameters with deviations; those that were not told have the deviation NaN.
+        Parameters with deviations; those that were not fitted have the deviation NaN.
     free
         Places of the identified parameters in `PARAMETERS`.
     remarks
@@ -361,7 +361,7 @@ def _not_told(place: int, deviation: float) -> str:
     if place in SCALED:
         size = f"{100.0 * min(deviation, 9.99):.0f} %"
     kept = "leans on the nominal value" if place in GUESSED else "the nominal value is kept"
-    return f"{word}: not told by these logs (1 sigma {size}), {kept}; {advice}"
+    return f"{word}: not determined by these logs (1 sigma {size}), {kept}; {advice}"
 
 
 def _vehicle(

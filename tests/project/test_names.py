@@ -1,4 +1,4 @@
-"""A user's folder or file that hides one of the packages is told of at the import."""
+"""A user's folder or file that hides one of the packages is reported at the import."""
 
 import os
 import subprocess

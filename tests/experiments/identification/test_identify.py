@@ -253,10 +253,10 @@ def test_what_a_log_cannot_tell_is_said(tmp_path: Path) -> None:
     log = driven(tmp_path, lateral_acceleration=1e-3, seconds=40.0)
     found = identify([log], WRONG, name="found")
     told = "\n".join(found.remarks)
-    assert "front cornering stiffness: not told by these logs (1 sigma" in told
+    assert "front cornering stiffness: not determined by these logs (1 sigma" in told
     assert "leans on the nominal value; steer in bends" in told
-    assert "rear cornering stiffness: not told" in told
-    assert "yaw inertia: not told" in told
+    assert "rear cornering stiffness: not determined" in told
+    assert "yaw inertia: not determined" in told
     assert all(len(line) < 300 for line in found.remarks)
     assert np.abs(relative(found, WRONG)).max() < 0.5
     assert found.fit.deviations[model.FRONT] > 0.25
