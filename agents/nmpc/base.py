@@ -18,7 +18,7 @@ from agents.nmpc.problem import HORIZON, PERIOD, NmpcProblem
 from agents.nmpc.schedule import Switching
 from agents.reference import local_reference
 from agents.speed_cap import GRIP_SHARE
-from agents.weights import TrackingWeights, WeightSchedule, weights_from
+from agents.weights import FULL_SIZE, TrackingWeights, WeightSchedule, weights_from
 from lpv_track_env.observation import ObservationLayout, TrackingObservation
 from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.tyres import FRICTION
@@ -50,7 +50,8 @@ class NmpcSettings:
         Number of stages N; by default as many as grow by about `GROWTH` each.
     stages
         Lengths of the stages, s: one number for all, or (N,). By default the first is as long as
-        the control period, the others grow geometrically, and the last ends with the preview.
+        the control period, the others grow geometrically, and the last ends with the preview, or
+        earlier for small vehicles (`stages_of`).
     weights
         Fixed weights, a schedule, or the file of a schedule. Either may be given as a mapping, too:
         `{"Q": [4 numbers], "S": [4], "R": [2], "R_rate": [2]}`, or a schedule in the form of its
@@ -160,9 +161,16 @@ def growing_stages(first: float, total: float, count: int | None = None) -> tupl
 
 
 def stages_of(
-    settings: NmpcSettings, layout: ObservationLayout, control_period: float
+    settings: NmpcSettings,
+    layout: ObservationLayout,
+    control_period: float,
+    vehicle: VehicleParameters,
 ) -> tuple[float, ...]:
     """Return the lengths of an agent's stages, s, which the preview must cover.
+
+    By default they cover it, but those of a vehicle with a wheelbase L under `FULL_SIZE` only
+    sqrt(L/FULL_SIZE) of it: times of similar vehicles scale with the root of their size (Froude).
+    Stages of up to 0.27 s, in which `f1tenth` turns by a radian, let it swing on small ovals.
 
     Raises
     ------
@@ -171,7 +179,8 @@ def stages_of(
     """
     period, seen = layout.preview_period, layout.preview_steps * layout.preview_period
     if settings.stages is None:
-        return growing_stages(max(control_period, SHORTEST_STAGE), seen, settings.horizon)
+        covered = seen * math.sqrt(min(vehicle.wheelbase / FULL_SIZE, 1.0))
+        return growing_stages(max(control_period, SHORTEST_STAGE), covered, settings.horizon)
     lengths = settings.stages
     if isinstance(lengths, float):
         most = max(int(seen / lengths + 1e-6), 1) if settings.horizon is None else settings.horizon
@@ -218,9 +227,10 @@ class NmpcAgent(TrackingAgent[Memory], ABC):
                 "lpv-nmpc-tuned can: give a number, 'known' or 'linear'"
             )
         self.estimated_range = estimated_range(task) if self.estimated else (math.inf, math.inf)
-        stages = stages_of(settings, task.layout, task.control_period)
+        vehicle = settings.model or task.vehicle
+        stages = stages_of(settings, task.layout, task.control_period, vehicle)
         self.problem = NmpcProblem(
-            vehicle=settings.model or task.vehicle,
+            vehicle=vehicle,
             horizon=len(stages),
             stages=stages,
             first_period=task.control_period,

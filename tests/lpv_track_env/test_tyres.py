@@ -8,7 +8,14 @@ import pytest
 from numpy.typing import NDArray
 
 from lpv_track_env import bicycle, lpv, tyres
-from lpv_track_env.bicycle import VX, VY, YAW_RATE, derivative, inverse_speed
+from lpv_track_env.bicycle import (
+    VX,
+    VY,
+    YAW_RATE,
+    derivative,
+    inverse_speed,
+    longest_substep,
+)  # fmt: skip
 from lpv_track_env.integration import integrate, integrate_sliding, integrate_with
 from lpv_track_env.plausibility import GRAVITY
 from lpv_track_env.vehicle import BMW_320I, M2_MINIBUS, VEHICLES, VehicleParameters
@@ -220,8 +227,9 @@ def test_integration_converges(car: VehicleParameters, friction: float) -> None:
             )
         return np.array(now)
 
-    exact = swerve(2000)
-    errors = [float(np.abs(swerve(steps) - exact).max()) for steps in (10, 20, 40)]
+    own = math.ceil(0.1 / longest_substep(car))
+    exact = swerve(100 * own)
+    errors = [float(np.abs(swerve(steps) - exact).max()) for steps in (own // 2, own, 2 * own)]
     assert errors[1] <= 1e-4
     assert errors[2] <= 0.35 * errors[0]
     slid = integrate(*state, -2.0, 0.15, *parameters, 0.005, 20)

@@ -168,7 +168,8 @@ def test_what_the_context_says_of_a_vehicle(name: str) -> None:
     assert set(CONTEXT_SCALES) == set(CONTEXT)
     scaling = usual_scaling(here, context=tuple(CONTEXT))
     features = with_context(scaling, here).features_of(np.zeros((1, here.layout.size)))[0]
-    assert np.abs(features[-len(CONTEXT) :]).max() < 2.5
+    if car.wheelbase > 2.0:  # scales are those of cars: karts and model cars stand out
+        assert np.abs(features[-len(CONTEXT) :]).max() < 2.5
 
 
 @pytest.mark.parametrize("origin", ["actuators", "lpv-nmpc"])

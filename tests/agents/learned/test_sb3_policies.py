@@ -140,7 +140,7 @@ def test_a_model_of_plain_sb3_is_imported(
     assert "28 -> 28 -> 64 -> 64 -> 2" in capsys.readouterr().out
     policy = read(file.with_name("mine.json"))
     assert policy.training["steps"] == 32
-    agent = agents.make(str(file.with_name("mine.json")), env)
+    agent = agents.make(str(file.with_name("mine.json")), env.unwrapped)
     observation, _ = env.reset(seed=0)
     half = np.array([4.25, np.pi / 6])
     for _ in range(10):

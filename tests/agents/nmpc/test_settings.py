@@ -20,12 +20,13 @@ from agents.nmpc.rti_solver import RtiSolver
 from agents.registry import agent_class
 from agents.weight_tuning.agent import TunedNmpc
 from agents.weights import TrackingWeights, WeightSchedule
+from experiments.run.rollout import rollout
 from lpv_track_env.bicycle import casadi_derivative
 from lpv_track_env.conditions import IDEAL
 from lpv_track_env.env import PathTrackingEnv
 from lpv_track_env.observation import ObservationLayout
 from lpv_track_env.vehicle import M2_MINIBUS, VEHICLES, VehicleParameters
-from trajectories import CurvatureBands
+from trajectories import CurvatureBands, ReferencePath
 
 SET = {"Q": [1, 1, 20, 20], "S": [5, 5, 100, 100], "R": [0.01, 1]}
 SCHEDULE = WeightSchedule(
@@ -120,7 +121,7 @@ def test_stages_grow_by_one_factor_to_the_end_of_the_preview(
 ) -> None:
     seen = preview[0] * preview[1]
     stages = np.array(
-        stages_of(NmpcSettings(horizon=horizon), ObservationLayout(*preview), control)
+        stages_of(NmpcSettings(horizon=horizon), ObservationLayout(*preview), control, M2_MINIBUS)
     )
     assert stages.sum() == pytest.approx(seen, rel=1e-9)
     assert horizon in {None, len(stages)}
@@ -133,7 +134,7 @@ def test_stages_grow_by_one_factor_to_the_end_of_the_preview(
         # One stage less would have to grow faster.
         assert factors.mean() <= GROWTH + 1e-9
         less = stages_of(
-            NmpcSettings(horizon=len(stages) - 1), ObservationLayout(*preview), control
+            NmpcSettings(horizon=len(stages) - 1), ObservationLayout(*preview), control, M2_MINIBUS
         )
         assert less[1] / less[0] > GROWTH
 
@@ -241,3 +242,22 @@ def test_positions_weigh_by_the_size_of_small_vehicles() -> None:
     assert np.array(small.Q) / full.Q == pytest.approx([1.0, 1.0, factor, factor])
     assert np.array(small.S) / full.S == pytest.approx([1.0, 1.0, factor, factor])
     assert (small.R, small.R_rate) == (full.R, full.R_rate)
+
+
+def test_the_horizon_of_small_vehicles_is_shorter() -> None:
+    agent: Any = agents.make("lpv-nmpc", PathTrackingEnv("T2", "f1tenth"))
+    assert sum(agent.problem.periods) == pytest.approx(2.0 * math.sqrt(0.3302 / 2.0), rel=1e-3)
+    assert agent.problem.periods[0] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("size", [3.0, 5.0, 7.0])
+def test_a_small_car_does_not_swing_on_small_ovals(size: float) -> None:
+    """Ellipses with radii of 1.1 to 2.5 m at 5 m/s^2, where coarse stages made it swing."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 120, endpoint=False)
+    points = size * np.column_stack([np.cos(angle), 0.6 * np.sin(angle)])
+    car = VEHICLES["f1tenth"]
+    path = ReferencePath.from_waypoints(points, closed=True, vehicle=car, smoothing=0.0)
+    env = PathTrackingEnv(path, car)
+    driven = rollout(env, agents.make("lpv-nmpc", env), seed=0)
+    assert driven.end == "finished"
+    assert np.abs(driven.trace.lateral_error).max() < 0.03
