@@ -60,10 +60,13 @@ def beneath(env: Env) -> tuple[Env, list[Rescaling]]:
     TypeError
         For many environments in one.
     """
-    if getattr(env, "num_envs", None) is not None and not isinstance(env, gymnasium.Env):
+    given: Any = env
+    if getattr(given, "num_envs", None) is not None and not isinstance(given, gymnasium.Env):
+        wrapped = isinstance(given, gymnasium.vector.VectorWrapper)
+        such = "in the same kind of wrapper" if wrapped else "such as envs.single or envs.envs[0]"
         raise TypeError(
-            f"{type(env).__name__} holds {env.num_envs} environments: make the agent for one, such "
-            "as envs.single or envs.envs[0]; it takes batches of observations, too"
+            f"{type(given).__name__} holds {given.num_envs} environments: make the agent for one, "
+            f"{such}; it takes batches of observations, too"
         )
     undone = []
     while isinstance(env, gymnasium.Wrapper) and not hasattr(env, "layout"):

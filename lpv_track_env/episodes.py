@@ -17,7 +17,7 @@ from lpv_track_env.draws import uniform
 from lpv_track_env.reward import TERMS
 from lpv_track_env.steady_turn import turn_steadily
 from trajectories.compilation import compiled, compiled_internal
-from trajectories.table import SPEED, cell, curvature_at, heading_at, position_at, speed_at
+from trajectories.table import curvature_at, heading_at, position_at, speed_at
 
 Array = NDArray[Any]
 Infos = dict[str, Any]
@@ -101,9 +101,9 @@ def begin(
 ) -> None:  # fmt: skip
     """Begin an episode: draw its start, set the state, write record and observation.
 
-    The vehicle starts in the steady turn of the path's curvature, moving along the path but for the
-    errors, and on a closed path with the reference's acceleration: as it would come round. One that
-    does not reverse starts at standstill rather than below it.
+    The vehicle starts in the steady turn of the path's curvature, at a constant speed and moving
+    along the path but for the errors. One that does not reverse starts at standstill rather than
+    below it.
 
     Parameters
     ----------
@@ -136,15 +136,10 @@ def begin(
     if not math.isnan(given[2]):
         record[PSI] = heading + heading_error
     record[kernels.STEERING] = steering
-    a = p[ROLLING_DECELERATION] + slowing
-    if closed:
-        cells = table.shape[0] - 1
-        index, _ = cell(s, length, closed, cells + 1)
-        before, after = table[index, SPEED], table[index + 1, SPEED]
-        a += 0.5 * (after * after - before * before) * cells / length
     record[kernels.ACCELERATION] = kernels.clip(
-        a, p[kernels.LOWEST_ACCELERATION], p[kernels.HIGHEST_ACCELERATION]
-    )
+        p[ROLLING_DECELERATION] + slowing,
+        p[kernels.LOWEST_ACCELERATION], p[kernels.HIGHEST_ACCELERATION],
+    )  # fmt: skip
     record[kernels.ARC_LENGTH] = s
     kernels.start(record, p, table, observation)
 

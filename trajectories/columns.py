@@ -35,7 +35,11 @@ NAMES: dict[str, tuple[dict[str, float], str]] = {
     "time": (TIMES, "t time timestamp"),
     "speed": (
         SPEED_UNITS,
-        "v vx velocity speed vel vx_racetraj longitudinal_velocity target_speed gps_speed linear_x",
+        (
+            "v vx velocity speed vel vx_racetraj longitudinal_velocity target_speed gps_speed "
+            "linear_x linear_velocity desired_velocity desired_speed reference_speed ref_speed "
+            "v_ref spd"
+        ),
     ),
     "sideways": (SPEED_UNITS, "vy"),
     "width_right": (LENGTHS, "w_tr_right width_right w_right"),
@@ -46,10 +50,12 @@ NAMES: dict[str, tuple[dict[str, float], str]] = {
 }
 """Units of each quantity, and its names in lower case, the likelier ones first."""
 KNOWN = {
-    f"{name}{unit and '_'}{unit}": (quantity, rank, factor)
+    f"{name}{unit and joint}{unit}": (quantity, rank, factor)
     for quantity, (units, names) in NAMES.items()
     for rank, name in enumerate(names.split())
     for unit, factor in {"": 1.0, **units}.items()
+    for joint in ("_", "")
+    if joint or len(unit) > 2  # as in speedKmh
 }
 """Quantity, rank and factor by name."""
 KNOWN_NAMES = "known are x, y, v, lat, lon, h, t, w_right, w_left and others, with units as v_kmh"
@@ -175,9 +181,17 @@ class _Points:
             columns["speed"] = self._speeds()
             index = self.found["speed"][1]
             metadata["speed_column"] = shortened(self.table.header[index], 40)
+        elif "speed" not in self and (others := self._others()):
+            metadata["others"] = f"no speed among its other columns {others}"
         places = [f"line {line}" for line in self.table.lines]
         file = self.table.file
         return RawPath(kind, str(file), file.stem, columns, places, metadata=metadata)
+
+    def _others(self) -> str:
+        """Return the names of the columns that stand for nothing known."""
+        header = self.table.header
+        names = [name for name in header if name not in {"", IGNORED} and known(name) is None]
+        return shortened(", ".join(names), 80)
 
     def _drop_rows_without_fix(self) -> dict[str, str]:
         """Leave out rows without latitude and longitude, and return words that say so."""

@@ -21,7 +21,7 @@ NO_LIMITS = SpeedLimits(
 """Limits that leave all speeds of a file as they are."""
 SPEED_UNITS = {
     "m/s": 1.0, "mps": 1.0, "ms": 1.0, "m_s": 1.0, "km/h": 1.0 / 3.6, "kmh": 1.0 / 3.6,
-    "kph": 1.0 / 3.6, "km_h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0,
+    "kph": 1.0 / 3.6, "km_h": 1.0 / 3.6, "kmph": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0,
     "knots": 1852.0 / 3600.0,
 }  # fmt: skip
 """Factors from a unit to m/s."""

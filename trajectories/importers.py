@@ -35,8 +35,10 @@ GPS_SMOOTHING = 0.2
 """Usual smoothing of metres and of latitudes and longitudes, m rms, and 3 times as much at any
 point. The first removes the jitter of points 5 m apart (on one track the largest curvature falls
 from 0.162 to 0.114 1/m)."""
-SAID = ("part", "missing", "skipped")
+SAID = ("part", "missing", "skipped", "others")
 """Keys of readers' metadata whose texts are part of `metadata["imported"]`."""
+UNUSUAL = 20.0
+"""m/s^2: lateral acceleration, twice that of a good tyre, that suggests another unit of speed."""
 FASTEST = 200.0
 """Highest speed in a file, m/s; higher ones suggest another unit."""
 BINDING = {
@@ -284,6 +286,11 @@ def _speed(
         f"speeds of {column}, {given.min():.3g} to {given.max():.3g} m/s, up to "
         f"{lateral:.2g} m/s² laterally"
     )
+    if lateral > UNUSUAL:
+        findings.warn(
+            f"its speeds need up to {lateral:.0f} m/s² laterally: if they are in km/h, give "
+            "speed_unit='km/h'"
+        )
     if cut[k] < 1e-3:
         findings.notes.append(f"{said}, kept")
         return speed

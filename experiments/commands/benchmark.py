@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from experiments.run.store import ResultStore
 
 EXAMPLE = "lpv-track benchmark --agents stanley lqr --trajectories T1 T2 --out results/mine"
+MOST_WARNINGS = 10
+"""Different warnings of the drives that are printed."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -119,6 +121,11 @@ def finish(store: "ResultStore", cases: Sequence[Mapping[str, Any]], console: Co
     # The files that were just driven with; the folder may name others.
     named = {str(case.get(key)) for case in cases for key in ("trajectory", "vehicle")}
     report = write_report(store.folder, NamedFiles(frozenset(named)))
+    told = dict.fromkeys(str(text) for case in cases for text in case.get("warnings", ()))
+    for text in [*told][:MOST_WARNINGS]:
+        console.out(f"warning: {text}", highlight=False)
+    if len(told) > MOST_WARNINGS:
+        console.out(f"and {len(told) - MOST_WARNINGS} more warnings in the report", highlight=False)
     failed = print_failed(cases, console)
     lines = [where(report)]
     if not complete:

@@ -47,9 +47,12 @@ class NamedFiles:
 
     opened: frozenset[str] | None = frozenset()
 
-    def path(self, trajectory: str) -> ReferencePath | None:
-        """Return the path of a name or file; None if it cannot be loaded or may not be opened."""
-        return None if self.closed_path(trajectory) else reference_path(trajectory)
+    def path(self, trajectory: str, car: VehicleParameters | None) -> ReferencePath | None:
+        """Return the path of a name or file for a vehicle; None if it is not to be had.
+
+        It cannot be loaded, or may not be opened.
+        """
+        return None if self.closed_path(trajectory) else reference_path(trajectory, car)
 
     def car(self, case: Result) -> VehicleParameters | None:
         """Return the vehicle of a case; None if it cannot be loaded or may not be opened."""
@@ -85,7 +88,7 @@ class Drive:
     @property
     def path(self) -> ReferencePath | None:
         """Its path, or None if it cannot be loaded or may not be opened."""
-        return self.files.path(self.trajectory)
+        return self.files.path(self.trajectory, self.car)
 
     @property
     def car(self) -> VehicleParameters | None:
@@ -223,10 +226,10 @@ def _grouped(drives: Iterable[Drive], key: Callable[[Drive], Key]) -> dict[Key, 
 
 
 @cache
-def reference_path(trajectory: str) -> ReferencePath | None:
-    """Return the path of a trajectory's name or file, or None if it cannot be loaded."""
+def reference_path(trajectory: str, car: VehicleParameters | None) -> ReferencePath | None:
+    """Return the path of a name or file for a vehicle, or None if it cannot be loaded."""
     try:
-        return trajectories.load(trajectory)
+        return trajectories.load(trajectory, vehicle=car)
     except (ValueError, OSError):
         return None
 

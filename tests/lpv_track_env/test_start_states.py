@@ -50,17 +50,6 @@ def test_a_given_heading_error_is_that_of_the_vehicles_axis() -> None:
     assert env.reset(options={"heading_error": 0.1})[1]["heading_error"] == pytest.approx(0.1)
 
 
-def test_a_closed_path_starts_with_the_reference_acceleration() -> None:
-    n = 401
-    speed = 8.0 + 2.0 * np.sin(np.linspace(0.0, 2.0 * np.pi, n))
-    speed[-1] = speed[0]
-    path = CIRCLE.with_speed(np.interp(CIRCLE.arc_length, np.linspace(0, CIRCLE.length, n), speed))
-    env = PathTrackingEnv(path, "bmw-320i")
-    _, info = env.reset(seed=0)
-    rates = derivative(info["state"], np.array(env.actuators), env.vehicle)
-    assert rates[0] == pytest.approx(float(path.acceleration[0]), abs=1e-4)
-
-
 @pytest.mark.parametrize("plant", ["bicycle", "drift"])
 def test_limited_tyres_start_with_the_slip_that_they_need(plant: str) -> None:
     """At 0.7 g the slip is far beyond the linear one; the held command keeps to the circle."""

@@ -350,3 +350,29 @@ def test_arrays_that_are_no_path_are_refused(points: Any, options: Any, message:
     with pytest.raises(ValueError, match=message) as caught:
         ReferencePath.from_waypoints(points, **options)
     assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("column", "unit"),
+    [("velocity_kmph", 1 / 3.6), ("speedKmh", 1 / 3.6), ("v_ref", 1.0), ("linear_velocity", 1.0)],
+)
+def test_other_names_of_speeds(tmp_path: Path, column: str, unit: float) -> None:
+    file = tmp_path / "line.csv"
+    file.write_text(f"x,y,{column}\n" + "".join(f"{5 * k},0,18\n" for k in range(20)))
+    assert load(file).speed.max() == pytest.approx(18.0 * unit)
+
+
+def test_columns_among_which_there_is_no_speed_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "line.csv"
+    file.write_text("x,y,Tempo,z\n" + "".join(f"{5 * k},0,18,1\n" for k in range(20)))
+    said = load(file).metadata["imported"]
+    assert "no speed among its other columns tempo, z" in said.lower()
+
+
+def test_speeds_that_no_tyre_holds_may_be_in_kmh(tmp_path: Path) -> None:
+    file = tmp_path / "circle.csv"
+    angles = np.linspace(0.0, 2.0 * np.pi, 100)
+    rows = [f"{30 * np.cos(a)},{30 * np.sin(a)},36" for a in angles]
+    file.write_text("\n".join(["x,y,speed", *rows]))
+    with pytest.warns(UserWarning, match=r"need up to 43 m/s² laterally: if they are in km/h"):
+        load(file)

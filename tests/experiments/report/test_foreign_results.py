@@ -182,9 +182,9 @@ def test_a_report_opens_no_file_that_the_cases_name_unless_told(
     opened: list[str] = []
     for module in (trajectories, vehicle):
 
-        def noted(name: str, load: Callable[[str], Any] = module.load) -> Any:
+        def noted(name: str, load: Callable[..., Any] = module.load, **more: Any) -> Any:
             opened.append(name)
-            return load(name)
+            return load(name, **more)
 
         monkeypatch.setattr(module, "load", noted)
     reference_path.cache_clear()
