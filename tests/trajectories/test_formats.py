@@ -49,7 +49,7 @@ def database(statement: str, folder: Path) -> bytes:
         ("x.csv", zipped("[Content_Types].xml", "xl/workbook.xml"), "an Excel workbook"),
         ("x.kmz", zipped("doc.kml"), "a KMZ archive, which is not read: unpack it"),
         ("x.zip", zipped("a.csv"), "a ZIP archive"),
-        ("x.csv.gz", gzip.compress(b"x,y\n"), "a compressed file"),
+        ("x.csv.gz", gzip.compress(b"x,y\n", mtime=0), "a compressed file"),
         ("x.mat", b"MATLAB 5.0 MAT-file, Platform: GLNXA64", "a MATLAB file"),
         ("x.mat", b"\0\0\0\0\1\0\0\0", "a MATLAB file"),
         ("x.h5", b"\x89HDF\r\n\x1a\n\0", "an HDF5 file"),
