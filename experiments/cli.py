@@ -21,7 +21,7 @@ COMMANDS = {
     "benchmark": "Run agents x trajectories x seeds, print the paper's table, write report.html.",
     "report": "Rebuild the table and report.html from saved cases alone.",
     "drive": "Watch a run live, or write its frames or a video; several agents side by side.",
-    "trajectories": "Print published against achieved rows of the six trajectories and draw them.",
+    "trajectories": "Read paths and files, print the paper's rows of them, draw and write them.",
     "limits": "Compute the physical limits of lane changes and laps by optimal control.",
     "speed": "Measure how fast the environments and the solvers are, against their peers.",
     "ablation": "Drive with each disturbance of a real vehicle alone, with and without "

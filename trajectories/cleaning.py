@@ -181,7 +181,8 @@ def _check_steps(raw: RawPath, closed: bool, findings: Findings) -> None:
     if (back := _reversal(points, closed)) is not None:
         raw.fail(
             f"the path turns back by {back[1]:.0f} degrees at point {back[0]} "
-            f"({raw.places[back[0]]}); if that is jitter, a minimum_distance takes it out"
+            f"({raw.places[back[0]]}); if that is jitter, a minimum_distance "
+            "(--minimum-distance) takes it out"
         )
     widest = int(np.argmax(distances))
     median = float(np.median(distances))

@@ -34,7 +34,8 @@ def oddities(geometry: Geometry, closed: bool, spacing: float) -> list[str]:
     if near is not None:
         found.append(
             f"the path comes within {near[2]:.2f} m of itself, at {near[0]:.1f} m and "
-            f"{near[1]:.1f} m: project with the last arc length at hand"
+            f"{near[1]:.1f} m: agents keep to their branch; in your own code, call "
+            "project(x, y, near=...) with the last arc length"
         )
     return found
 

@@ -110,7 +110,7 @@ def _read(entry: Path) -> Array:
 
 def _write(entry: Path, array: Array) -> None:
     content = np.ascontiguousarray(array, "<f8").tobytes()
-    # What a crash of the system tears does not pass its checksum.
+    # A file that a crash of the system tears does not pass its checksum.
     write_atomically(entry, CHECKSUM(content).digest() + content, durable=False)
     if entry.name.startswith(SEARCHED):
         _remove_oldest(entry.parent)

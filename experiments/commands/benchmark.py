@@ -121,8 +121,10 @@ def finish(store: "ResultStore", cases: Sequence[Mapping[str, Any]], console: Co
     # The files that were just driven with; the folder may name others.
     named = {str(case.get(key)) for case in cases for key in ("trajectory", "vehicle")}
     report = write_report(store.folder, NamedFiles(frozenset(named)))
-    told = dict.fromkeys(str(text) for case in cases for text in case.get("warnings", ()))
-    for text in [*told][:MOST_WARNINGS]:
+    texts = dict.fromkeys(str(text) for case in cases for text in case.get("warnings", ()))
+    # The same warning stands there with and without the name of its file.
+    told = [one for one in texts if not any(one != more and more.endswith(one) for more in texts)]
+    for text in told[:MOST_WARNINGS]:
         console.out(f"warning: {text}", highlight=False)
     if len(told) > MOST_WARNINGS:
         console.out(f"and {len(told) - MOST_WARNINGS} more warnings in the report", highlight=False)

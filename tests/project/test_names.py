@@ -49,7 +49,7 @@ def hide(folder: Path, name: str, kind: str) -> None:
 def test_hidden_packages_are_told_of(name: str, kind: str, install: str, tmp_path: Path) -> None:
     hide(tmp_path, name, kind)
     done = run(tmp_path, "import lpv_track_env\nprint('imported')\n", install)
-    # Of folders on the path Python takes one with an __init__.py, if there is any.
+    # Among the folders on the path, Python takes one with an __init__.py, if there is any.
     hidden = not (kind == "folder" and install == "ordinary")
     told = [line for line in done.stderr.splitlines() if "hides the package" in line]
     assert len(told) == hidden
