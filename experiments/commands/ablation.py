@@ -10,10 +10,11 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.commands.options import (
+    add_engine,
     add_out,
     add_seeds,
     add_trajectories,
-    add_workers,
+    engine_of,
     resumable,
     seeds_of,
 )
@@ -58,7 +59,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_trajectories(parser, ["T2", "T5"])
     add_seeds(parser, 10)
     add_out(parser, "results/ablation")
-    add_workers(parser)
+    add_engine(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -78,7 +79,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     }  # fmt: skip
     with resumable(options, console):
         store = run_benchmark(
-            specs, options.out, workers=options.workers, settings=settings, console=console
+            specs, options.out, engine=engine_of(options), settings=settings, console=console
         )
     if print_failed(selected(store, specs), console):
         # Means without the failed cases would not be comparable.

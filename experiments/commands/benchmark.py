@@ -45,7 +45,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         parser, "--vehicle-set", "vehicle fields to change, e.g. max_lateral_velocity_ratio=0.5"
     )
     shared.add_out(parser, "results/benchmark")
-    shared.add_workers(parser)
+    shared.add_engine(parser)
     parser.add_argument(
         "--case-limit", type=shared.number(0.0, 1e9, "s", above=True), metavar="S",
         help="a case that takes longer has failed, s (default 1800). With --workers 1 it cannot "
@@ -102,7 +102,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         Case(**specs[0]).make_env().close()
     with shared.resumable(options, console, "the same command with --resume"):
         store = run_benchmark(
-            specs, options.out, workers=options.workers, settings=settings,
+            specs, options.out, engine=shared.engine_of(options), settings=settings,
             resume=options.resume, console=console,
             limit=CASE_LIMIT if options.case_limit is None else options.case_limit,
         )  # fmt: skip

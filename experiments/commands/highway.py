@@ -53,7 +53,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--every", type=shared.whole(1, 10**9), default=20, metavar="N", help="default 20"
     )
     shared.add_out(parser, "results/highway")
-    shared.add_workers(parser)
+    shared.add_engine(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -111,7 +111,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     TrafficCase(**specs[0]).make_env().close()
     with shared.resumable(options, console):
         store = run_benchmark(
-            specs, options.out, workers=options.workers, console=console, kind=TrafficCase,
+            specs, options.out, engine=shared.engine_of(options), console=console, kind=TrafficCase,
             settings={"experiment": "highway", "drives": len(specs)},
         )  # fmt: skip
     results = selected(store, specs, TrafficCase)

@@ -22,10 +22,11 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.commands.options import (
+    add_engine,
     add_out,
     add_seeds,
     add_trajectories,
-    add_workers,
+    engine_of,
     file_name,
     resumable,
     seeds_of,
@@ -61,7 +62,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="times.json of an earlier run, in place of recording",
     )  # fmt: skip
     add_out(parser, "results/latency")
-    add_workers(parser)
+    add_engine(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -86,7 +87,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         cells = specs_of(recorded, options.trajectories, seeds_of(options))
         specs = [spec for cell in cells.values() for spec in cell]
         store = run_benchmark(
-            specs, folder, workers=options.workers, settings=settings, console=console
+            specs, folder, engine=engine_of(options), settings=settings, console=console
         )
     if print_failed(selected(store, specs), console):
         # Means without the failed cases would not be comparable.

@@ -10,6 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
+from experiments.run.engines import ENGINES, Engine
 from trajectories.arguments import shown
 
 EXIT_FAILED = 1
@@ -116,6 +117,33 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
         "--workers", type=whole(1, MOST_WORKERS), default=os.cpu_count() or 1, metavar="N",
         help="default: all cores",
     )  # fmt: skip
+
+
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """Add `--workers`, `--engine` and `--address`; `engine_of` reads them."""
+    parser.add_argument(
+        "--workers", type=whole(1, MOST_WORKERS), metavar="N",
+        help="processes (default: all cores; with --engine ray, all CPUs of the cluster)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--engine", choices=ENGINES, default=ENGINES[0],
+        help="local processes (default), or a Ray cluster: pip install 'lpv-track-env[ray]'",
+    )  # fmt: skip
+    parser.add_argument(
+        "--address", metavar="ADDRESS",
+        help="of the Ray cluster, e.g. 10.0.0.1:6379 or auto (default: one on this computer)",
+    )  # fmt: skip
+
+
+def engine_of(options: argparse.Namespace) -> Engine:
+    """Return the engine that `--workers`, `--engine` and `--address` ask for.
+
+    Raises
+    ------
+    ValueError
+        For an address without the engine that it belongs to.
+    """
+    return Engine(options.workers, options.engine, options.address)
 
 
 def add_start(parser: argparse.ArgumentParser) -> None:

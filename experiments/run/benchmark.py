@@ -18,9 +18,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from experiments.run import engines
 from experiments.run.case import BaseCase, Case, failed_case, run_case
-from experiments.run.engines import Interrupts
+from experiments.run.engines import Engine, Interrupts
 from experiments.run.folder_lock import TRACES, locked
 from experiments.run.provenance import version_changes
 from experiments.run.store import ResultStore
@@ -43,7 +42,7 @@ def run_benchmark(
     specs: Sequence[Spec],
     folder: Path,
     *,
-    workers: int,
+    engine: Engine,
     settings: Mapping[str, Any],
     console: Console,
     resume: bool = True,
@@ -60,8 +59,8 @@ def run_benchmark(
         Fields of cases of the class `kind`.
     folder
         Folder of results, made if need be; locked meanwhile.
-    workers
-        Number of processes; 1: this one.
+    engine
+        Where the cases run.
     settings
         Entries of the manifest.
     console
@@ -71,17 +70,15 @@ def run_benchmark(
     kind
         Class of the cases.
     limit
-        Time limit of a case, s: one that takes longer has failed. With one worker, an agent that
+        Time limit of a case, s: one that takes longer has failed. In this process, an agent that
         never returns from native code is not ended, see `experiments.run.time_limit.TimeLimit`.
 
     Raises
     ------
     ValueError
-        For an unknown name, no workers, a limit that is not positive, a folder that another process
+        For an unknown name, a limit that is not positive, a folder that another process
         writes in, or one that holds results while `resume` is off.
     """
-    if workers < 1:
-        raise ValueError(f"workers must be at least 1, not {workers}")
     if not limit > 0.0:
         raise ValueError(f"the time limit of a case must be positive, not {limit:g} s")
     by_id = {}
@@ -116,7 +113,7 @@ def run_benchmark(
             console.print(note, markup=False, highlight=False)
         store.write_manifest({**settings, "cases": list(by_id)})
         if missing:
-            _run(list(missing.values()), kind, store, workers, console, limit)
+            _run(list(missing.values()), kind, store, engine, console, limit)
     return store
 
 
@@ -152,7 +149,7 @@ def progress_bar(console: Console) -> Progress:
 
 
 def _run(
-    specs: Sequence[Spec], kind: type[BaseCase], store: ResultStore, workers: int,
+    specs: Sequence[Spec], kind: type[BaseCase], store: ResultStore, engine: Engine,
     console: Console, limit: float,
 ) -> None:  # fmt: skip
     progress = progress_bar(console)
@@ -164,12 +161,10 @@ def _run(
             progress.update(bar, description=label(spec))
 
         run, failed = partial(run_case, kind=kind), partial(failed_case, kind=kind)
-        # Also for a single case: only from another process can native code be ended.
-        results = (
-            engines.in_process(specs, run, started, failed, limit)
-            if workers == 1
-            else engines.local_pool(specs, workers, run, started, failed, limit)
-        )
+        results = engine.run(
+            specs, run, started=started, failed=failed, limit=limit,
+            files=partial(named_files, kind=kind),
+        )  # fmt: skip
         for count, result in enumerate(results, start=1):
             # Before the result is stored: a case may have taken Ctrl-C for a failed solve.
             interrupts.check()
@@ -184,6 +179,11 @@ def _run(
                     f"{result['end'] or result.get('error')}",
                     markup=False, highlight=False,
                 )  # fmt: skip
+
+
+def named_files(spec: Spec, kind: type[BaseCase] = Case) -> list[Path]:
+    """Return the files that a case reads, beside the project's sources."""
+    return [file for file in kind(**spec).files() if file is not None and file.is_file()]
 
 
 def label(spec: Spec) -> str:

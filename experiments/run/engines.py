@@ -15,9 +15,11 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.connection import wait as wait_for
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -27,6 +29,10 @@ Result = dict[str, Any]
 Spec = Mapping[str, Any]
 Run = Callable[[Spec], Result]
 Failed = Callable[[Spec, str], Result]
+Files = Callable[[Spec], Sequence[Path]]
+Folder = Callable[[Spec], Path]
+
+ENGINES = ("local", "ray")
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 DIED = "the worker process died, twice"
@@ -68,6 +74,63 @@ class Interrupts:
         """Raise KeyboardInterrupt if Ctrl-C was pressed inside the context."""
         if self._came:
             raise KeyboardInterrupt
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Place where specs run: this process, local worker processes, or a Ray cluster.
+
+    Parameters
+    ----------
+    workers
+        Number of processes; local 1: this process. None: all cores, or all CPUs of the cluster.
+    name
+        One of `ENGINES`.
+    address
+        Address of the Ray cluster; None: one on this computer, made for the run.
+    """
+
+    workers: int | None = None
+    name: str = "local"
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise ValueError(f"workers must be at least 1, not {self.workers}")
+        if self.name not in ENGINES:
+            raise ValueError(f"engine must be one of {', '.join(ENGINES)}, not {self.name!r}")
+        if self.address is not None and self.name != "ray":
+            raise ValueError("--address is that of a Ray cluster: it needs --engine ray")
+
+    def run(
+        self,
+        specs: Sequence[Spec],
+        run: Run | None = None,
+        *,
+        started: Callable[[Spec], None] | None = None,
+        failed: Failed | None = None,
+        limit: float = math.inf,
+        files: Files | None = None,
+        folder: Folder | None = None,
+    ) -> Iterator[Result]:
+        """Run specs and yield results as they end; see `local_pool`.
+
+        Parameters
+        ----------
+        files
+            Names the files that a spec's run reads, beside the project's sources; the Ray engine
+            brings them to the computer that runs it.
+        folder
+            Names the folder that a spec's run reads and writes; the Ray engine brings its content
+            there and back.
+        """
+        del files, folder
+        if self.name == "ray":
+            raise ValueError("--engine ray is not there yet")
+        workers = self.workers or os.cpu_count() or 1
+        if workers == 1:
+            return in_process(specs, run, started, failed, limit)
+        return local_pool(specs, workers, run, started, failed, limit)
 
 
 def late(limit: float) -> str:

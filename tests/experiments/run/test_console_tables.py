@@ -9,8 +9,9 @@ import pytest
 from rich.console import Console
 
 from experiments.commands.benchmark import finish
-from experiments.run import benchmark, suites
+from experiments.run import benchmark, engines, suites
 from experiments.run.console_tables import SCREEN, screen
+from experiments.run.engines import Engine
 from experiments.run.store import ResultStore
 from tests.helpers.made_results import case, folder_of, printed
 
@@ -78,11 +79,11 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(
         for number, spec in enumerate(specs):
             yield case(number, seed=spec["seed"])
 
-    monkeypatch.setattr(benchmark.engines, "in_process", results)
+    monkeypatch.setattr(engines, "in_process", results)
     monkeypatch.setattr(benchmark.Case, "check", lambda _: None)
     monkeypatch.setattr(ResultStore, "append", lambda *_: None)
     console = Console(width=120, file=io.StringIO())
-    benchmark.run_benchmark(specs, tmp_path, workers=1, settings={}, console=console)
+    benchmark.run_benchmark(specs, tmp_path, engine=Engine(1), settings={}, console=console)
     lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
     assert len(lines) == most
     assert lines[-1].startswith(f"[{count}/{count}, ")

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from experiments.run.benchmark import run_benchmark
 from experiments.run.case import run_case
+from experiments.run.engines import Engine
 from experiments.run.result_schema import plain
 from experiments.run.store import ResultStore
 from experiments.run.time_limit import TimeLimit
@@ -31,7 +32,7 @@ def spec(name: str, **more: Any) -> dict[str, Any]:
 def swept(folder: Path, names: list[str], **more: Any) -> dict[str, dict[str, Any]]:
     """Results of a sweep by the agent's class, as the folder holds them."""
     specs = [spec(name) for name in names]
-    settings: dict[str, Any] = {"workers": 1, "settings": {}, **more}
+    settings: dict[str, Any] = {"engine": Engine(1), "settings": {}, **more}
     store = run_benchmark(specs, folder, console=Console(file=io.StringIO()), **settings)
     return {case["agent"].rpartition(":")[2]: case for case in store.cases()}
 
@@ -104,7 +105,9 @@ def test_traces_are_not_written_through_a_link(tmp_path: Path) -> None:
 
 def test_workers_survive_what_ends_a_process_and_are_killed_in_native_code(tmp_path: Path) -> None:
     began = time.monotonic()
-    found = swept(tmp_path, ["Sticks", "Exits", "Interrupts", "Rolls"], workers=2, limit=20.0)
+    found = swept(
+        tmp_path, ["Sticks", "Exits", "Interrupts", "Rolls"], engine=Engine(2), limit=20.0
+    )
     assert found["Sticks"]["error"] == "took longer than 20 s"
     assert found["Interrupts"]["error"] == "KeyboardInterrupt: "
     assert found["Exits"]["error"] == EXPECTED["Exits"]
@@ -135,7 +138,7 @@ def test_a_path_whose_warnings_are_no_list_is_refused_at_the_start(
     specs = [{"agent": "stanley", "trajectory": name} for name in (str(file), "u-turn")]
     console = Console(file=io.StringIO())
     with pytest.raises(ValueError, match=r"own\.csv: .*warnings"):
-        run_benchmark(specs, tmp_path / "out", workers=1, settings={}, console=console)
+        run_benchmark(specs, tmp_path / "out", engine=Engine(1), settings={}, console=console)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +153,7 @@ def test_a_case_that_no_folder_could_give_back_is_refused_at_the_start(
     first = {"agent": f"{own}:Own", "trajectory": "u-turn"}
     specs = [first, {**first, "agent_settings": {"own": settings}}]
     with pytest.raises(ValueError, match=r"^(the result: |agent_settings\.own\.a is nan)"):
-        run_benchmark(specs, tmp_path / "out", workers=1, settings={}, console=console)
+        run_benchmark(specs, tmp_path / "out", engine=Engine(1), settings={}, console=console)
     assert not (tmp_path / "out").exists()
 
 

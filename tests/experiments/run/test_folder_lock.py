@@ -13,6 +13,7 @@ from rich.console import Console
 
 from experiments.run import folder_lock
 from experiments.run.benchmark import run_benchmark
+from experiments.run.engines import Engine
 from experiments.run.folder_lock import locked
 
 HOLD = """
@@ -28,7 +29,7 @@ SPECS = [{"agent": "stanley", "trajectory": "u-turn"}]
 
 def sweep(folder: Path, **more: Any) -> None:
     run_benchmark(
-        SPECS, folder, workers=1, settings={}, console=Console(file=io.StringIO()), **more
+        SPECS, folder, engine=Engine(1), settings={}, console=Console(file=io.StringIO()), **more
     )
 
 

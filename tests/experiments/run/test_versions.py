@@ -12,6 +12,7 @@ from experiments.report.build import write_report
 from experiments.run import provenance
 from experiments.run.benchmark import run_benchmark
 from experiments.run.case import Case
+from experiments.run.engines import Engine
 from experiments.run.provenance import computing_versions, manifest_key
 from experiments.run.store import ResultStore
 from experiments.run.traffic import TrafficCase
@@ -43,7 +44,7 @@ def other_versions(monkeypatch: pytest.MonkeyPatch) -> Any:
 def sweep(folder: Path) -> str:
     """Run the case, or find it there; return what was printed."""
     console = Console(file=io.StringIO(), width=400)
-    run_benchmark([SPEC], folder, workers=1, settings={}, console=console)
+    run_benchmark([SPEC], folder, engine=Engine(1), settings={}, console=console)
     text: str = console.file.getvalue()  # type: ignore[attr-defined]
     return text
 
