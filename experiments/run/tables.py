@@ -7,6 +7,7 @@ mean and its 95 % interval by the t-distribution.
 
 import hashlib
 import json
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -49,6 +50,13 @@ PUBLISHED_NOTE = (
     "with the vehicle. They are for orientation only, since its vehicle, weights and paths are not "
     "public."
 )
+TUNED = "lpv-nmpc-tuned"
+"""Agent that drives with the weights of a tuning."""
+TRAINED = re.compile(
+    r"(?:(?P<folder>.+)[/\\])?seed-(?P<seed>0|[1-9]\d{0,2})[/\\](?:policy|weights)\.json",
+    re.DOTALL,
+)
+"""File of one of several trainings, which `--seeds` puts into folders beside each other."""
 LONGEST, CUT = 80, 48
 """Most characters of a setting's value in a label, and those that are kept of a longer one."""
 
@@ -256,23 +264,50 @@ def path_names(trajectories: Iterable[str]) -> dict[str, str]:
     }
 
 
+def training_of(case: Result) -> int | None:
+    """Return the training seed of a case's agent, one of several in a folder; None for others."""
+    return _trained(case)[1]
+
+
 def label_of(case: Result) -> str:
-    """Return a case's agent, with its settings if any; this names its rows."""
-    settings = case.get("agent_settings")
-    return f"{case.get('agent', '?')}" + (f" ({_changes(settings)})" if settings else "")
+    """Return a case's agent, with its settings if any; this names its rows.
+
+    The policies in `FOLDER/seed-N/policy.json` are one agent called FOLDER, and so is
+    `lpv-nmpc-tuned` with the weights in `FOLDER/seed-N/weights.json`; `training_of` gives N.
+    """
+    return _trained(case)[0]
+
+
+def _trained(case: Result) -> tuple[str, int | None]:
+    """Return the label of a case's agent and its training seed."""
+    agent, settings = str(case.get("agent", "?")), case.get("agent_settings") or {}
+    found = TRAINED.fullmatch(agent)
+    if found is None and (found := TRAINED.fullmatch(str(settings.get("weights")))):
+        folder = found["folder"] or "."
+        settings = {key: value for key, value in settings.items() if key != "weights"}
+        if agent == TUNED:
+            agent = folder
+        else:
+            settings["weights"] = folder
+    elif found is not None:
+        agent = found["folder"] or "."
+    label = f"{agent} ({_changes(settings)})" if settings else agent
+    return label, int(found["seed"]) if found is not None else None
 
 
 def labels(cases: Iterable[Result]) -> list[str]:
     """Return the labels of agents in the order of the registry, each once."""
-    rank = _rank(agents.names())
-    found = {label_of(case): str(case.get("agent")) for case in cases}
-    return sorted(found, key=lambda label: (rank(found[label]), label))
+    return list(by_label(cases))
 
 
 def by_label(cases: Iterable[Result]) -> dict[str, list[Result]]:
-    """Group cases by the label of their agent, in the order of `labels`."""
-    cases = list(cases)
-    return {label: [case for case in cases if label_of(case) == label] for label in labels(cases)}
+    """Group cases by the label of their agent, in the order of the registry."""
+    rank = _rank(agents.names())
+    found: dict[str, list[Result]] = {}
+    for case in cases:
+        found.setdefault(label_of(case), []).append(case)
+    order = sorted(found, key=lambda label: (rank(str(found[label][-1].get("agent"))), label))
+    return {label: found[label] for label in order}
 
 
 def current(cases: Iterable[Result]) -> list[Result]:
