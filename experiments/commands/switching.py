@@ -158,7 +158,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 def _sources() -> str:
     """Return a digest of the sources that a result depends on."""
-    from experiments.run.case import project_digest
+    from experiments.run.provenance import project_digest
     from experiments.study import weight_switching
 
     own = Path(weight_switching.__file__).read_text()

@@ -10,7 +10,6 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ import gymnasium
 import numpy as np
 
 import agents
-import lpv_track_env
 import trajectories
 from agents.base import CHECKPOINTS
 from agents.registry import check_settings, source_file
@@ -31,6 +29,7 @@ from experiments.run.provenance import (
     computing_versions,
     file_digest,
     manifest_key,
+    project_digest,
 )
 from experiments.run.result_schema import as_stored
 from experiments.run.rollout import Rollout, rollout
@@ -43,7 +42,6 @@ from lpv_track_env.task import check_start
 from lpv_track_env.validation import checked_start
 from lpv_track_env.vehicle import VehicleParameters
 from trajectories.arguments import instance_of, shortened
-from trajectories.compilation import source_digest
 from trajectories.naming import choose
 
 VEHICLE_FIELDS = tuple(field.name for field in fields(VehicleParameters))
@@ -353,17 +351,6 @@ class Case(BaseCase):
             **({} if computing is None else {"latency": computing.summary()}),
             "trace": driven.trace.as_dict(),
         }
-
-
-@cache
-def project_digest() -> str:
-    """Return the digest of all sources that a result depends on."""
-    packages = (trajectories, lpv_track_env, agents)
-    folders = [Path(str(package.__file__)).parent for package in packages]
-    here = Path(__file__).parent
-    names = ("case", "rollout", "metrics", "computing", "learning_cost", "search", "traffic")
-    own = "".join((here / f"{name}.py").read_text() for name in names)
-    return hashlib.sha256((source_digest(*folders) + own).encode()).hexdigest()[:16]
 
 
 def run_case(spec: Mapping[str, Any], kind: type[BaseCase] = Case) -> dict[str, Any]:

@@ -2,9 +2,11 @@
 
 import hashlib
 import importlib.metadata
+import importlib.util
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -21,6 +23,11 @@ COMPUTING = ("numpy", "scipy", "numba", "llvmlite", "casadi", "gymnasium")
 """Packages that compute every result: their versions are part of a case's id."""
 OPTIONAL = ("torch", "stable-baselines3", "piqp", "highway-env", "commonroad-vehicle-models")
 """Packages that a user's own agent may compute with, where they are installed."""
+HERE = Path(__file__).parent
+RUN = ("case", "rollout", "metrics", "computing", "learning_cost", "search", "traffic")
+"""Modules of this folder that a result depends on."""
+FEATURES = re.compile(r"s?sse|avx|fma|f16c|xop|neon|fp-armv8|fullfp16|dotprod|bf16|sve|sme|vsx")
+"""Beginnings of the processor features that decide how floating-point numbers are computed."""
 
 
 def provenance() -> dict[str, Any]:
@@ -56,22 +63,47 @@ def load_average() -> list[float] | None:
     return list(os.getloadavg()) if hasattr(os, "getloadavg") else None
 
 
+@cache
+def project_digest() -> str:
+    """Return the digest of all sources that a result depends on."""
+    # Imported late: it loads Numba.
+    from trajectories.compilation import source_digest
+
+    folders = [_folder(package) for package in ("trajectories", "lpv_track_env", "agents")]
+    own = "".join((HERE / f"{name}.py").read_text("utf-8") for name in RUN)
+    return hashlib.sha256((source_digest(*folders) + own).encode()).hexdigest()[:16]
+
+
+def _folder(package: str) -> Path:
+    """Return a package's folder, without importing it."""
+    found = importlib.util.find_spec(package)
+    assert found is not None
+    assert found.origin is not None
+    return Path(found.origin).parent
+
+
 def revision() -> dict[str, Any]:
-    """Return the sources' Git `commit` and whether they are `modified`; None outside a checkout."""
-    here = Path(__file__).parent
+    """Return the digest of the `sources`, and of a checkout its `commit` and if it is `modified`.
+
+    An installed wheel has no commit, even inside another project's checkout.
+    """
 
     def git(*arguments: str) -> str | None:
         try:
             done = subprocess.run(  # noqa: S603  fixed arguments
-                ["git", "-C", str(here), *arguments],  # noqa: S607
+                ["git", "-C", str(HERE), *arguments],  # noqa: S607
                 capture_output=True, text=True, timeout=10, check=False,
             )  # fmt: skip
         except (OSError, subprocess.TimeoutExpired):
             return None
         return done.stdout.strip() if done.returncode == 0 else None
 
-    commit, changes = git("rev-parse", "HEAD"), git("status", "--porcelain", "--untracked-files=no")
-    return {"commit": commit, "modified": None if changes is None else bool(changes)}
+    found: dict[str, Any] = {"sources": project_digest()}
+    file = Path(__file__).name
+    if git("ls-files", "--full-name", "--error-unmatch", file) == f"experiments/run/{file}":
+        changes = git("status", "--porcelain", "--untracked-files=no")
+        found |= {"commit": git("rev-parse", "HEAD"), "modified": bool(changes)}
+    return found
 
 
 def versions(*further: str) -> dict[str, str]:
@@ -91,8 +123,8 @@ def computing_versions(*packages: str) -> dict[str, str]:
 
 @cache
 def manifest_key() -> str:
-    """Return the key of the present versions of all packages that results depend on."""
-    present = [versions(), platform.machine()]
+    """Return the key of all that last digits depend on: versions, sources, processor features."""
+    present = [versions(), project_digest(), platform.machine(), *processor_features()]
     return hashlib.sha256(json.dumps(present, sort_keys=True).encode()).hexdigest()[:8]
 
 
@@ -119,8 +151,22 @@ def _installed(*packages: str) -> dict[str, str]:
     return found
 
 
+@cache
+def processor_features() -> tuple[str, tuple[str, ...]]:
+    """Return LLVM's name of the processor, and its features that matter to numerics.
+
+    Numba compiles for both; OpenBLAS chooses its kernels likewise.
+    """
+    # Slow to import, and needed only here.
+    from llvmlite import binding
+
+    features = binding.get_host_cpu_features()
+    names = sorted(name for name, there in features.items() if there and FEATURES.match(name))
+    return str(binding.get_host_cpu_name()), tuple(names)
+
+
 def hardware() -> dict[str, Any]:
-    """Return processor, cores, memory (GiB) and operating system."""
+    """Return processor and what it can (`processor_features`), cores, memory (GiB) and system."""
     processor = platform.processor() or platform.machine()
     memory = None
     try:
@@ -131,8 +177,11 @@ def hardware() -> dict[str, Any]:
         memory = round(pages * size / 2**30, 1)
     except (OSError, ValueError):
         pass
+    architecture, features = processor_features()
     return {
         "processor": processor,
+        "architecture": architecture,
+        "features": list(features),
         "cores": os.cpu_count(),
         "memory_gib": memory,
         "system": platform.system(),

@@ -172,11 +172,24 @@ class ResultStore:
 
     def manifest(self) -> dict[str, Any]:
         """Return the manifest of the last run, or {} without a readable one."""
-        file = self.folder / "manifest.json"
-        try:
-            return checked(read_json(file), dict[str, Any], file)
-        except ValueError:
-            return {}
+        return _manifest(self.folder / "manifest.json")
+
+    def manifest_of(self, key: str) -> dict[str, Any]:
+        """Return the manifest with a key, that of the last run or an earlier one; {} without it.
+
+        Results of old versions name none; theirs has the key "before".
+        """
+        last = self.manifest()
+        if last and last.get("key", "before") == key:
+            return last
+        return _manifest(self.folder / f"manifest-{key}.json") if is_key(key) else {}
+
+
+def _manifest(file: Path) -> dict[str, Any]:
+    try:
+        return checked(read_json(file), dict[str, Any], file)
+    except ValueError:
+        return {}
 
 
 def write_json(file: Path, content: Mapping[str, Any]) -> None:

@@ -127,9 +127,13 @@ def test_the_manifest_says_what_was_run_where(store):
     assert store.manifest() == written
     assert written["settings"] == {"suite": "paper", "seeds": [0, 1]}
     assert written["format"] == "lpv-track-results/1"
-    assert set(written["revision"]) == {"commit", "modified"}
+    assert written["revision"]["sources"] == provenance.project_digest()
+    assert store.manifest_of(written["key"]) == written
+    assert store.manifest_of("00000000") == store.manifest_of("../before") == {}
     assert {"python", "numpy", "casadi", "lpv-track-env"} <= set(written["versions"])
-    assert {"processor", "cores", "memory_gib", "system"} == set(written["hardware"])
+    assert set(written["hardware"]) == {
+        "processor", "architecture", "features", "cores", "memory_gib", "system",
+    }  # fmt: skip
     assert written["written"].endswith("+00:00")
     assert "/" not in written["command"][0]
 
@@ -140,12 +144,12 @@ def test_a_damaged_manifest_is_none(store, content):
     assert store.manifest() == {}
 
 
-def test_without_git_the_revision_is_unknown(monkeypatch):
+def test_without_git_the_revision_is_the_digest_of_the_sources(monkeypatch):
     def missing(*arguments, **settings):
         raise FileNotFoundError("git")
 
     monkeypatch.setattr(provenance.subprocess, "run", missing)
-    assert provenance.revision() == {"commit": None, "modified": None}
+    assert provenance.revision() == {"sources": provenance.project_digest()}
 
 
 def test_an_atomic_write_replaces_the_whole_file_and_leaves_nothing_beside_it(tmp_path):

@@ -87,6 +87,7 @@ def test_a_sweep_with_other_versions_runs_anew_and_says_so(
     kept = json.loads((tmp_path / f"manifest-{first['key']}.json").read_text())
     assert kept == {**first, "written": kept["written"]}
     assert cases[0]["manifest"] == first["key"]
+    assert ResultStore(tmp_path).manifest_of(first["key"]) == kept
     assert cases[1]["manifest"] == json.loads((tmp_path / "manifest.json").read_text())["key"]
     page = write_report(tmp_path).read_text()
     assert "1 older result of cases" in page
@@ -101,7 +102,9 @@ def test_a_folder_of_an_earlier_version_of_the_project_is_read_and_gone_on_with(
     del case["manifest"], manifest["key"]
     (tmp_path / "cases.jsonl").write_text(json.dumps({**case, "id": "0123456789abcdef"}) + "\n")
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    assert ResultStore(tmp_path).manifest_of("before") == manifest
     assert "u-turn" in write_report(tmp_path).read_text()
     assert "1 of 1 cases are run anew" in sweep(tmp_path)
     assert len(ResultStore(tmp_path).cases()) == 2
     assert json.loads((tmp_path / "manifest-before.json").read_text()) == manifest
+    assert ResultStore(tmp_path).manifest_of("before") == manifest

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run.compare import EXAMPLE, compare, main
-from tests.helpers.made_results import case, folder_of
+from experiments.run.compare import EXAMPLE, main
+from experiments.run.exact import compare, values_of
+from tests.helpers.made_results import METRICS, case, folder_of
 
 
 def test_equal_results_have_no_difference(
@@ -59,6 +60,32 @@ def test_cases_of_one_folder_alone_are_differences(tmp_path: Path) -> None:
     assert lost.endswith(f"only in {tmp_path / 'a'}")
     assert "agent_settings {'gain': 2.0}" in added
     assert added.endswith(f"only in {tmp_path / 'b'}")
+
+
+def test_values_are_single_numbers_and_texts_without_times() -> None:
+    result = case(
+        1, solver={"slack": [0.0, 0.5, 0.0], "statuses": {"SUCCESS": 3}, "mean_iterations": None},
+        metrics={"predict_median": 0.1}, tried=[[5.0, True], [6.0, False]], warnings=["cold"],
+        latency={"median": 0.02}, error=None,
+    )  # fmt: skip
+    found = dict(values_of(result))
+    metrics = {name for name in found if name.startswith("metrics.")}
+    assert metrics == {f"metrics.{name}" for name in METRICS}
+    assert {name: value for name, value in found.items() if name not in metrics} == {
+        "status": "ok", "end": "finished", "solver.failures": 0, "solver.solves": 0,
+        "solver.slack[0]": 0.0, "solver.slack[1]": 0.5, "solver.slack[2]": 0.0,
+        "solver.statuses.SUCCESS": 3, "warnings[0]": "cold", "latency.median": 0.02,
+        "tried[0][0]": 5.0, "tried[0][1]": True, "tried[1][0]": 6.0, "tried[1][1]": False,
+    }  # fmt: skip
+
+
+def test_searches_that_tried_other_values_are_one_case(tmp_path: Path) -> None:
+    folder_of(tmp_path / "a", [case(1, tried=[[5.0, True]])], traces=False)
+    folder_of(tmp_path / "b", [case(2, tried=[[5.0, False]])], traces=False)
+    found = compare(tmp_path / "a", tmp_path / "b")
+    assert found.paired == 1
+    (line,) = found.differences
+    assert line.endswith("tried[0][1] True -> False")
 
 
 def test_no_results_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
