@@ -11,9 +11,11 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from scipy.stats import t as student
 
@@ -94,33 +96,39 @@ class Setting(NamedTuple):
 
     def __str__(self) -> str:
         """Title of the setting's tables."""
-        parts = [self.regime, self.vehicle] if self.regime else [self.vehicle]
-        if changed := json.loads(self.vehicle_changes):
-            parts.append(f"with {_changes(changed)}")
-        speed = "" if self.fixed_speed is None else f" {self.fixed_speed} m/s"
-        grip = None if self.grip is None else f"{self.grip} of grip"
-        parts.append(grip or f"{self.speed_mode} speed{speed}")
-        if self.raw:
-            parts.append("raw waypoints")
-        if self.conditions != DEFAULT.conditions:
-            parts.append(f"conditions {conditions_words(json.loads(self.conditions))}")
-        if computing := json.loads(self.computing):
-            arrangement = computing.get("arrangement", "?")
-            parts.append(f"computing {arrangement} x {computing.get('load', 1):g}")
-        if self.control_period != DEFAULT.control_period:
-            parts.append(f"control period {self.control_period} s")
-        if changed := json.loads(self.env_settings):
-            parts.append(f"env {_changes(changed)}")
-        if changed := json.loads(self.start):
-            parts.append(f"start {_changes(changed)}")
-        return " · ".join(parts)
+        return _title(self)
+
+
+@lru_cache(maxsize=4096)
+def _title(setting: Setting) -> str:
+    parts = [setting.regime, setting.vehicle] if setting.regime else [setting.vehicle]
+    if changed := json.loads(setting.vehicle_changes):
+        parts.append(f"with {_changes(changed)}")
+    speed = "" if setting.fixed_speed is None else f" {setting.fixed_speed} m/s"
+    grip = None if setting.grip is None else f"{setting.grip} of grip"
+    parts.append(grip or f"{setting.speed_mode} speed{speed}")
+    if setting.raw:
+        parts.append("raw waypoints")
+    if setting.conditions != DEFAULT.conditions:
+        parts.append(f"conditions {conditions_words(json.loads(setting.conditions))}")
+    if computing := json.loads(setting.computing):
+        arrangement = computing.get("arrangement", "?")
+        parts.append(f"computing {arrangement} x {computing.get('load', 1):g}")
+    if setting.control_period != DEFAULT.control_period:
+        parts.append(f"control period {setting.control_period} s")
+    if changed := json.loads(setting.env_settings):
+        parts.append(f"env {_changes(changed)}")
+    if changed := json.loads(setting.start):
+        parts.append(f"start {_changes(changed)}")
+    return " · ".join(parts)
 
 
 def setting_of(case: Result) -> Setting:
     """Return the setting of a case; entries that an old result lacks are the default."""
 
     def text(name: str, default: Any) -> str:
-        return json.dumps(case.get(name) or default, sort_keys=True)
+        value = case.get(name) or default
+        return msgspec.json.encode(value, order="sorted").decode() if value else "{}"
 
     return Setting(
         vehicle=str(case.get("vehicle", "?")),
@@ -317,9 +325,11 @@ def current(cases: Iterable[Result]) -> list[Result]:
     holds both; averaged, they would count as two seeds. Entries that an old result lacks are the
     default.
     """
-    latest = {
-        repr([case.get(name, usual) for name, usual in USUAL.items()]): case for case in cases
-    }
+    latest: dict[bytes, Result] = {}
+    for case in cases:
+        fields = repr([case.get(name, usual) for name, usual in USUAL.items()])
+        # The digest, since a hundred thousand of these texts are a hundred megabytes.
+        latest[hashlib.blake2b(fields.encode(), digest_size=16).digest()] = case
     return list(latest.values())
 
 
