@@ -1,7 +1,7 @@
 """Ranking of agents over the regimes of a suite, drive by drive."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy.stats import rankdata
 
 from experiments.run import regimes
 from experiments.run.statistics import CONFIDENCE, RESAMPLES, rate_interval
-from experiments.run.tables import Result, label_of, labels
+from experiments.run.tables import USUAL, Result, by_label
 
 Array = NDArray[np.float64]
 
@@ -26,6 +26,12 @@ NOTE = (
 )
 LARGER_IS_BETTER = ("highest_fixed_speed",)
 """First figures of a regime of which the largest is the best."""
+
+
+DRIVE = tuple(
+    (name, usual) for name, usual in USUAL.items() if name not in {"agent", "agent_settings"}
+)
+"""Entries of a result that determine its drive, each with its default."""
 
 
 class Place(NamedTuple):
@@ -56,8 +62,16 @@ def ranking(cases: Iterable[Result], *, seed: int = 0) -> list[Place]:
 
     Drives that not all agents have are left out, so that every agent is ranked on the same ones.
     """
-    groups = list(regimes.by_regime(cases).values())
-    names = labels(case for group in groups for case in group)
+    return ranked([by_label(group) for group in regimes.by_regime(cases).values()], seed=seed)
+
+
+def ranked(groups: Sequence[Mapping[str, Sequence[Result]]], *, seed: int = 0) -> list[Place]:
+    """Rank entries, such as agents, over groups of drives: the cases of each entry by its name.
+
+    Every group counts alike. Of several results of an entry in one drive, as several trainings of
+    one agent have them, the median counts.
+    """
+    names = list(dict.fromkeys(name for group in groups for name in group))
     losses = [found for group in groups if len(found := _losses(group, names))]
     if not losses:
         return []
@@ -65,7 +79,7 @@ def ranking(cases: Iterable[Result], *, seed: int = 0) -> list[Place]:
     random = np.random.default_rng(seed)
     drawn = np.mean(
         [_resampled_means(found, random) for found in ranks], axis=0
-    )  # (resamples, agents)
+    )  # (resamples, entries)
     low, high = np.quantile(drawn, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2], axis=0)
     mean = np.mean([found.mean(axis=0) for found in ranks], axis=0)
     best = np.sum([_among_best(found) for found in losses], axis=0)
@@ -81,32 +95,33 @@ def ranking(cases: Iterable[Result], *, seed: int = 0) -> list[Place]:
     return sorted(places, key=lambda place: (place.rank, place.label))
 
 
-def _losses(group: Sequence[Result], names: Sequence[str]) -> Array:
-    """Return the loss of every agent in every drive that all have, (drives, agents).
+def _losses(group: Mapping[str, Sequence[Result]], names: Sequence[str]) -> Array:
+    """Return the loss of every entry in every drive that all have, (drives, entries).
 
     The loss is the first figure of the regime, or 1 over it where larger is better; inf in a drive
     that failed.
     """
-    column = regimes.columns_of(group)[0]
-    found: dict[str, dict[str, float]] = {}
-    for case in group:
-        figure = regimes.figure(case, column) if regimes.passed(case) else None
-        if figure is not None and column.key in LARGER_IS_BETTER:
-            figure = 1.0 / figure
-        drive = found.setdefault(_drive(case), {})
-        drive[label_of(case)] = np.inf if figure is None else figure
+    column = regimes.columns_of(case for cases in group.values() for case in cases)[0]
+    found: dict[str, dict[str, list[float]]] = {}
+    for name, cases in group.items():
+        for case in cases:
+            figure = regimes.figure(case, column) if regimes.passed(case) else None
+            if figure is not None and column.key in LARGER_IS_BETTER:
+                figure = 1.0 / figure if figure > 0.0 else None
+            drive = found.setdefault(drive_of(case), {})
+            drive.setdefault(name, []).append(np.inf if figure is None else figure)
     shared = [drive for drive in found.values() if len(drive) == len(names)]
-    whole = [[drive[name] for name in names] for drive in shared]
+    whole = [[float(np.median(drive[name])) for name in names] for drive in shared]
     return np.array(whole, dtype=np.float64).reshape(-1, len(names))
 
 
-def _drive(case: Result) -> str:
-    """Return all that determines a drive except its agent."""
-    names = (
-        "trajectory", "vehicle", "vehicle_changes", "speed_mode", "fixed_speed", "grip",
-        "conditions", "env_settings", "start", "search", "seed",
-    )  # fmt: skip
-    return json.dumps([case.get(name) for name in names], sort_keys=True)
+def drive_of(case: Result) -> str:
+    """Return all that determines a drive except its agent, as text.
+
+    Entries that an old result lacks are the default.
+    """
+    values = [usual if (value := case.get(name)) is None else value for name, usual in DRIVE]
+    return json.dumps(values, sort_keys=True)
 
 
 def _resampled_means(ranks: Array, random: np.random.Generator) -> Array:

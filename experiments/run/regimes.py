@@ -102,8 +102,8 @@ def by_regime(cases: Iterable[Result]) -> dict[str, list[Result]]:
 def columns_of(cases: Iterable[Result]) -> tuple[Mean, ...]:
     """Return the columns of means for the cases of a regime."""
     for case in cases:
-        if search := case.get("search"):
-            return SEARCHED[str(search["setting"])]
+        if setting := (case.get("search") or {}).get("setting"):
+            return SEARCHED[setting]
         if case.get("start"):
             return FROM_STARTS
     return MEANS

@@ -60,6 +60,12 @@ class Computing(TypedDict, total=False):
     load: Number
 
 
+class Searched(TypedDict, total=False):
+    """Arguments of `experiments.run.search.Search`."""
+
+    setting: Literal["fixed_speed", "grip"]
+
+
 class Stored(TypedDict, total=False):
     """A line of `cases.jsonl`; old results lack some entries, and there may be further ones."""
 
@@ -81,6 +87,7 @@ class Stored(TypedDict, total=False):
     computing: Computing | None
     regime: Name
     start: Settings
+    search: Searched | None
     end: Name | None
     error: Text | None
     seconds: Time

@@ -1,0 +1,84 @@
+"""`lpv-track leaderboard`: one page and Markdown of result folders, a sample of each row rerun."""
+
+import argparse
+import shlex
+
+from rich.console import Console
+
+from experiments.commands import options as shared
+
+EXAMPLE = "lpv-track leaderboard results/benchmark results/limits --out build/leaderboard"
+SAMPLE = 5
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument(
+        "folders", nargs="+", type=shared.file_name, metavar="FOLDER", help="folder of results"
+    )
+    shared.add_out(parser, "build/leaderboard")
+    parser.add_argument(
+        "--sample", type=shared.whole(0, 100_000), default=SAMPLE, metavar="N",
+        help=f"cases of each row that are run again (default {SAMPLE}; 0: none)",
+    )  # fmt: skip
+    shared.add_seed(parser)
+    parser.add_argument("--title", default="Leaderboard", help="default: Leaderboard")
+    parser.add_argument(
+        "--open-named-files", action="store_true",
+        help="run the agents and open the files that the results name; for results you trust",
+    )  # fmt: skip
+    shared.add_engine(parser)
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Write `index.html` and `leaderboard.md`; return 1 if a row does not reproduce, else 0."""
+    from experiments.leaderboard import board, marks
+    from experiments.leaderboard.rows import sections_of
+    from trajectories.fileio import write_atomically
+
+    engine = shared.engine_of(options)
+    skipped: list[str] = []
+    sections = sections_of(options.folders, skipped)
+    rows = [row for section in sections for row in section.rows]
+    if not rows:
+        raise ValueError(skipped[0])
+    for line in skipped:
+        console.print(f"left out: {line}", markup=False, style="red")
+    samples = {row.key: marks.sample(row, options.sample, options.seed) for row in rows}
+    try:
+        found = marks.marks_of(
+            rows, samples, engine=engine, open_files=options.open_named_files, console=console
+        )
+    except KeyboardInterrupt:
+        console.print("interrupted: nothing is written; --sample 0 runs no case again")
+        raise
+    ids = {key: [str(case["id"]) for case in cases] for key, cases in samples.items()}
+    made = [(section, board.entries_of(section, found, ids)) for section in sections]
+    command = _command(options)
+    page = board.page(made, options.title, f"made by {command}", skipped)
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_atomically(options.out / "index.html", page.encode())
+    text = board.markdown(made, options.title, command, skipped)
+    write_atomically(options.out / "leaderboard.md", text.encode())
+    refuted = [row for row in rows if found[row.key].refuted]
+    for row in refuted:
+        mark = found[row.key]
+        console.print(
+            f"{row.label} in {row.folder}: {mark.words}: {mark.remark}", markup=False, style="red"
+        )
+    console.out(f"leaderboard: {options.out / 'index.html'}, {len(rows)} rows", highlight=False)
+    return 1 if refuted else 0
+
+
+def _command(options: argparse.Namespace) -> str:
+    """Return the command that makes the same page."""
+    words = ["lpv-track", "leaderboard", *map(str, options.folders), "--out", str(options.out)]
+    if options.sample != SAMPLE:
+        words += ["--sample", str(options.sample)]
+    if options.seed:
+        words += ["--seed", str(options.seed)]
+    if options.title != "Leaderboard":
+        words += ["--title", options.title]
+    if options.open_named_files:
+        words.append("--open-named-files")
+    return shlex.join(words)

@@ -1,0 +1,1 @@
+"""Leaderboard: rows of results folders that anybody hands in, with reruns of a sample of each."""

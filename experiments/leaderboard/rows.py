@@ -1,0 +1,239 @@
+"""Rows of the leaderboard: the results of an agent in a folder, on the drives of a suite.
+
+Rows are compared on the same drives only. Those of a suite are the ones that it gives to every
+agent; agents to which it gives less than half of the most, such as IPOPT's in `paper`, do not
+count. A folder that was made without a suite is compared with folders of exactly the same drives.
+"""
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.run import regimes, suites
+from experiments.run.case import Case
+from experiments.run.ranking import drive_of
+from experiments.run.result_schema import read_driven
+from experiments.run.store import ResultStore
+from experiments.run.tables import (
+    Result,
+    by_label,
+    current,
+    path_names,
+    setting_of,
+    training_of,
+    trainings,
+)
+from trajectories.arguments import shortened
+
+Array = NDArray[np.float64]
+
+CUSTOM = "custom"
+LONGEST = 120
+"""Most characters of a text from a folder that a cell shows."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Results of an agent in one folder, on the drives of a section.
+
+    Parameters
+    ----------
+    folder
+        The folder, as it was given.
+    name
+        Short name of the folder, which no other of the board has.
+    label
+        Label of the agent, see `experiments.run.tables.label_of`.
+    cases
+        Its results on the section's drives; of several trainings each has them.
+    further
+        Number of its results on other drives.
+    drives
+        Number of the section's drives.
+    manifests
+        Manifests of the runs that its cases come from.
+    """
+
+    folder: Path
+    name: str
+    label: str
+    cases: Sequence[Result]
+    further: int
+    drives: int
+    manifests: Sequence[Mapping[str, Any]]
+
+    @property
+    def key(self) -> str:
+        """Text that no other row of the board has."""
+        return f"{self.name}\n{self.label}"
+
+    @cached_property
+    def seeds(self) -> list[int]:
+        """Training seeds; empty for an agent that is no folder of several trainings."""
+        found = {seed for case in self.cases if (seed := training_of(case)) is not None}
+        return sorted(found)
+
+    @cached_property
+    def by_training(self) -> dict[int | None, dict[str, Result]]:
+        """Results by training seed and drive; one training, None, for all other agents."""
+        found: dict[int | None, dict[str, Result]] = {}
+        for case in self.cases:
+            found.setdefault(training_of(case), {})[drive_of(case)] = case
+        return found
+
+    @property
+    def shared(self) -> list[str]:
+        """Drives that it has, of several trainings those that all have."""
+        if not self.cases:
+            return []
+        first, *others = self.by_training.values()
+        return [drive for drive in first if all(drive in other for other in others)]
+
+    @property
+    def complete(self) -> bool:
+        """True if it has all drives of its section."""
+        return bool(self.cases) and len(self.shared) == self.drives
+
+    def losses(self, metric: str) -> Array:
+        """Return a metric of each training and shared drive, (trainings, drives).
+
+        A drive that failed counts as infinite.
+        """
+        of_training = [
+            [_loss(found[drive], metric) for drive in self.shared]
+            for found in self.by_training.values()
+        ]
+        return np.array(of_training, dtype=np.float64).reshape(len(self.by_training), -1)
+
+    @property
+    def strata(self) -> list[str]:
+        """Group of each shared drive, within which a bootstrap draws: regime, else path."""
+        first = next(iter(self.by_training.values()))
+        return [
+            str(first[drive].get("regime") or first[drive].get("trajectory"))
+            for drive in self.shared
+        ]
+
+    @property
+    def trained(self) -> list[dict[str, Any]]:
+        """Cost of each training, as far as it was recorded."""
+        return [training for _, training in trainings(self.cases)]
+
+
+def _loss(case: Result, metric: str) -> float:
+    return float(case["metrics"][metric]) if regimes.passed(case) else float("inf")
+
+
+@dataclass(frozen=True)
+class Section:
+    """Rows that have a suite in common.
+
+    Parameters
+    ----------
+    suite
+        Name of the suite; "custom" for folders that were made without one.
+    drives
+        The drives on which its rows are compared.
+    rows
+        The rows, in no order.
+    """
+
+    suite: str
+    drives: frozenset[str]
+    rows: list[Row]
+
+
+def sections_of(folders: Sequence[Path], skipped: list[str]) -> list[Section]:
+    """Read folders of results; no file is opened but theirs, and nothing is run.
+
+    Parameters
+    ----------
+    folders
+        The folders.
+    skipped
+        Receives a message for each line and each folder that cannot be read.
+
+    Raises
+    ------
+    ValueError
+        For what is no folder of results, and for a folder that is given twice.
+    """
+    resolved = [folder.resolve() for folder in folders]
+    for place, folder in enumerate(folders):
+        if not (folder / "cases.jsonl").is_file():
+            raise ValueError(f"no results in {shortened(folder)}: it holds no cases.jsonl")
+        if resolved.index(resolved[place]) < place:
+            raise ValueError(f"{shortened(folder)} is given twice")
+    names = _names([str(folder) for folder in folders])
+    found: dict[tuple[str, str], Section] = {}
+    for folder in folders:
+        store = ResultStore(folder)
+        cases = current(store.cases(skipped, read_driven))
+        if not cases:
+            skipped.append(f"{folder}: no line of cases.jsonl can be read")
+            continue
+        suite = _suite(store.manifest())
+        drives = drives_of_suite(suite) if suite != CUSTOM else frozenset(map(drive_of, cases))
+        section = found.setdefault((suite, _digest(drives)), Section(suite, drives, []))
+        section.rows.extend(_rows(folder, names[str(folder)], store, cases, drives))
+    known = [*suites.SUITES, CUSTOM]
+    return sorted(found.values(), key=lambda section: known.index(section.suite))
+
+
+def _rows(
+    folder: Path, name: str, store: ResultStore, cases: Sequence[Result], drives: frozenset[str]
+) -> Iterable[Row]:
+    for label, group in by_label(cases).items():
+        counted = [case for case in group if drive_of(case) in drives]
+        yield Row(
+            folder, name, label, counted, len(group) - len(counted), len(drives), [store.manifest()]
+        )
+
+
+def _suite(manifest: Mapping[str, Any]) -> str:
+    settings = manifest.get("settings")
+    suite = settings.get("suite") if isinstance(settings, Mapping) else None
+    return suite if isinstance(suite, str) and suite in suites.SUITES else CUSTOM
+
+
+def _names(folders: Sequence[str]) -> dict[str, str]:
+    """Return short names of folders: the last part, the last two, or all, so that they differ."""
+    short = path_names(folders)
+    found = list(short.values())
+    return {folder: name if found.count(name) == 1 else folder for folder, name in short.items()}
+
+
+def _digest(drives: frozenset[str]) -> str:
+    return hashlib.sha256("\n".join(sorted(drives)).encode()).hexdigest()
+
+
+@cache
+def drives_of_suite(suite: str) -> frozenset[str]:
+    """Return the drives of a suite that it gives to every agent, with as few seeds as it has."""
+    given: dict[str, set[str]] = {}
+    for agent in suites.default_agents():
+        for spec in suites.SUITES[suite]((agent,), (0,)):
+            given.setdefault(spec["agent"], set()).add(drive_of(Case(**spec).as_dict()))
+    most = max(len(own) for own in given.values())
+    return frozenset.intersection(
+        *(frozenset(own) for own in given.values() if 2 * len(own) >= most)
+    )
+
+
+def groups_of(rows: Sequence[Row]) -> list[dict[str, list[Result]]]:
+    """Return the groups of drives that count alike in a ranking: cases of each row by its key.
+
+    They are regimes where cases have one, else settings.
+    """
+    found: dict[str, dict[str, list[Result]]] = {}
+    for row in rows:
+        for case in row.cases:
+            group = str(case.get("regime") or setting_of(case))
+            found.setdefault(group, {}).setdefault(row.key, []).append(case)
+    return list(found.values())
