@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from experiments.commands.options import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
-from experiments.run.engines import one_thread
+from experiments.run.worker_process import one_thread
 
 if TYPE_CHECKING:
     from rich.console import Console

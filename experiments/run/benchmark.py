@@ -163,7 +163,8 @@ def _run(
         run, failed = partial(run_case, kind=kind), partial(failed_case, kind=kind)
         results = engine.run(
             specs, run, started=started, failed=failed, limit=limit,
-            files=partial(named_files, kind=kind),
+            files=partial(named_files, kind=kind), identity=partial(case_id, kind=kind),
+            machine=store.add_manifest,
         )  # fmt: skip
         for count, result in enumerate(results, start=1):
             # Before the result is stored: a case may have taken Ctrl-C for a failed solve.
@@ -184,6 +185,11 @@ def _run(
 def named_files(spec: Spec, kind: type[BaseCase] = Case) -> list[Path]:
     """Return the files that a case reads, beside the project's sources."""
     return [file for file in kind(**spec).files() if file is not None and file.is_file()]
+
+
+def case_id(spec: Spec, kind: type[BaseCase] = Case) -> str:
+    """Return the id of a case."""
+    return kind(**spec).id
 
 
 def label(spec: Spec) -> str:

@@ -1,49 +1,37 @@
 """Engines that run specs: in this process, or over a pool of local worker processes.
 
 A spec that takes longer than the limit, or that kills its worker twice, gets the result of a
-failure, and the sweep goes on. Workers talk over pipes: however they and this process end, nothing
-is left of them. Nothing here loads a numerical library, so `one_thread` can be called before they
-load.
+failure, and the sweep goes on.
 """
 
-import contextlib
 import math
-import multiprocessing
 import os
-import pickle
 import signal
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection
-from multiprocessing.connection import wait as wait_for
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from experiments.run.time_limit import TimeLimit
-
-Result = dict[str, Any]
-Spec = Mapping[str, Any]
-Run = Callable[[Spec], Result]
-Failed = Callable[[Spec, str], Result]
-Files = Callable[[Spec], Sequence[Path]]
-Folder = Callable[[Spec], Path]
+from experiments.run.worker_process import (
+    DIED,
+    PATIENCE,
+    Failed,
+    Files,
+    Folder,
+    Identity,
+    Machine,
+    Result,
+    Run,
+    Spec,
+    Worker,
+    late,
+    one_thread,
+    ready,
+)
 
 ENGINES = ("local", "ray")
-
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-DIED = "the worker process died, twice"
-PATIENCE = 5.0
-"""Time that an idle worker has to end by itself, s."""
-
-
-def one_thread() -> None:
-    """Give numerical libraries one thread, here and in child processes; call before they load."""
-    for variable in THREAD_VARIABLES:
-        os.environ.setdefault(variable, "1")
 
 
 class Interrupts:
@@ -112,6 +100,8 @@ class Engine:
         limit: float = math.inf,
         files: Files | None = None,
         folder: Folder | None = None,
+        identity: Identity | None = None,
+        machine: Machine | None = None,
     ) -> Iterator[Result]:
         """Run specs and yield results as they end; see `local_pool`.
 
@@ -123,19 +113,25 @@ class Engine:
         folder
             Names the folder that a spec's run reads and writes; the Ray engine brings its content
             there and back.
+        identity
+            Gives what must be the same on the computer that runs a spec, such as a case's id;
+            without it, the versions of all packages must be the same.
+        machine
+            Called with `key` and `experiments.run.provenance.provenance()` of each kind of computer
+            other than this one, before its first result.
         """
-        del files, folder
         if self.name == "ray":
-            raise ValueError("--engine ray is not there yet")
+            from experiments.run.ray_engine import run_on_ray
+
+            return run_on_ray(
+                specs, self.workers, self.address, run or _run_case(), failed or _failed_case(),
+                started=started, limit=limit, files=files, folder=folder, identity=identity,
+                machine=machine,
+            )  # fmt: skip
         workers = self.workers or os.cpu_count() or 1
         if workers == 1:
             return in_process(specs, run, started, failed, limit)
         return local_pool(specs, workers, run, started, failed, limit)
-
-
-def late(limit: float) -> str:
-    """Return the error of a run that took longer than the limit, s."""
-    return f"took longer than {limit:g} s"
 
 
 def in_process(
@@ -230,10 +226,10 @@ class _Pool:
         self._most, self._run, self._failed, self._limit = workers, run, failed, limit
         self._fresh = list(reversed(specs))
         self._suspects: list[Spec] = []
-        self._workers: list[_Worker] = []
+        self._workers: list[Worker] = []
 
     @property
-    def _busy(self) -> list["_Worker"]:
+    def _busy(self) -> list["Worker"]:
         return [worker for worker in self._workers if worker.spec is not None]
 
     @property
@@ -251,17 +247,17 @@ class _Pool:
             self._idle_worker().give(self._suspects.pop(), again=True)
         return begun
 
-    def _idle_worker(self) -> "_Worker":
+    def _idle_worker(self) -> "Worker":
         for worker in self._workers:
             if worker.spec is None:
                 return worker
-        self._workers.append(_Worker(self._run))
+        self._workers.append(Worker(self._run))
         return self._workers[-1]
 
     def collect(self) -> list[Result]:
         """Wait for messages, deaths and ends of time; return the results that there are."""
         results = []
-        for worker in self._ready():
+        for worker in ready(self._busy, self._limit):
             message = worker.message()
             if message is None:
                 results += self._replace(worker)
@@ -269,21 +265,7 @@ class _Pool:
                 results += message
         return results
 
-    def _ready(self) -> list["_Worker"]:
-        busy, limit = self._busy, self._limit
-        while True:
-            left = min(limit - worker.lasted for worker in busy)
-            # A dead worker's pipe stays open while its own children hold it: look every second.
-            ready = wait_for([worker.pipe for worker in busy], min(max(left, 0.0), 1.0))
-            found = [
-                worker
-                for worker in busy
-                if worker.pipe in ready or worker.lasted > limit or not worker.process.is_alive()
-            ]
-            if found:
-                return found
-
-    def _replace(self, worker: "_Worker") -> list[Result]:
+    def _replace(self, worker: "Worker") -> list[Result]:
         """End a worker that has died or exceeded its time; return what became of its spec."""
         worker.kill()
         self._workers.remove(worker)
@@ -306,123 +288,3 @@ class _Pool:
         """End all workers at once."""
         for worker in self._workers:
             worker.kill()
-
-
-class _Worker:
-    """A process that runs one spec after another."""
-
-    def __init__(self, run: Run) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, run))
-        with _interrupts_held():
-            self.process.start()
-        theirs.close()
-        self.spec: Spec | None = None
-        self.again = False
-        self._began = math.inf
-
-    @property
-    def lasted(self) -> float:
-        """Time since it began its spec, s; negative before."""
-        return time.monotonic() - self._began
-
-    def give(self, spec: Spec, *, again: bool) -> None:
-        """Give it a spec to run, for the second time if `again`."""
-        self.spec, self.again, self._began = spec, again, math.inf
-        # A worker that has died is noticed when its message is read.
-        with contextlib.suppress(OSError):
-            self.pipe.send(spec)
-
-    def message(self) -> list[Result] | None:
-        """Read what it sent: a result, or none yet; None if it has died or exceeded its time.
-
-        Raises
-        ------
-        BaseException
-            What the run raised.
-        """
-        try:
-            if not self.pipe.poll():
-                return None
-            kind, content = self.pipe.recv()
-        except Exception:  # noqa: BLE001  a torn message is anything
-            return None
-        if kind == "raised":
-            raise content
-        if kind == "begun":
-            self._began = time.monotonic()
-            return []
-        self.spec = None
-        return [content]
-
-    def kill(self) -> None:
-        """End it at once."""
-        self.process.kill()
-        self.process.join()
-        self.pipe.close()
-
-
-@contextlib.contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back, also in a process that is started here, until it ignores Ctrl-C itself."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    # Its start would let Ctrl-C through again.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _serve(pipe: Connection, run: Run) -> None:
-    """Run the specs that come through a pipe, until it is closed."""
-    _begin_worker()
-    while True:
-        try:
-            spec = pipe.recv()
-        except EOFError:
-            return
-        pipe.send(("begun", None))
-        try:
-            answer = pickle.dumps(("done", run(spec)))
-        except BaseException as error:  # noqa: BLE001  raised again in the parent
-            answer = _exception(error)
-        pipe.send_bytes(answer)
-
-
-def _exception(error: BaseException) -> bytes:
-    """Pickle an exception, or where that cannot be done its text."""
-    try:
-        answer = pickle.dumps(("raised", error))
-        pickle.loads(answer)  # noqa: S301  of our own making
-    except Exception:  # noqa: BLE001  anything can happen in an exception's own methods
-        return pickle.dumps(("raised", RuntimeError(f"a run raised {type(error).__name__}")))
-    return answer
-
-
-def _begin_worker() -> None:
-    """Ignore Ctrl-C, which the parent handles, and end when the parent ends or is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        wait_for([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
-    with contextlib.suppress(ImportError, AttributeError, OSError):
-        # The thread cannot run while native code holds the interpreter: there, the system ends the
-        # process, when the sentinel's other end is closed.
-        import fcntl
-
-        sentinel = int(parent.sentinel)
-        fcntl.fcntl(sentinel, fcntl.F_SETOWN, os.getpid())
-        flags = fcntl.fcntl(sentinel, fcntl.F_GETFL)
-        fcntl.fcntl(sentinel, fcntl.F_SETFL, flags | os.O_ASYNC)

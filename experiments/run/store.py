@@ -170,6 +170,14 @@ class ResultStore:
         write_json(self.folder / "manifest.json", manifest)
         return manifest
 
+    def add_manifest(self, machine: Mapping[str, Any]) -> None:
+        """Write `manifest-KEY.json` of another machine that takes part in the run.
+
+        `machine` has its `key` and provenance; all else is that of the run's manifest.
+        """
+        if is_key(key := str(machine["key"])):
+            write_json(self.folder / f"manifest-{key}.json", {**self.manifest(), **machine})
+
     def manifest(self) -> dict[str, Any]:
         """Return the manifest of the last run, or {} without a readable one."""
         return _manifest(self.folder / "manifest.json")

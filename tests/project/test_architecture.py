@@ -103,7 +103,7 @@ def direct() -> dict[str, str]:
 
 def test_every_direct_dependency_is_pinned() -> None:
     """Two want an environment of their own: they require other versions than the pinned ones."""
-    assert set(direct()) - set(constraints()) == {"ray", "tianshou"}
+    assert set(direct()) - set(constraints()) == {"tianshou"}
 
 
 def test_every_direct_dependency_has_a_lowest_version() -> None:

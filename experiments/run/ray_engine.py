@@ -1,0 +1,469 @@
+"""Engine that runs specs over the computers of a Ray cluster.
+
+An actor a CPU keeps a child process that runs one spec after another, as a local worker does. At
+most one spec is with an actor, so a sweep of any length holds few objects. The spec of a lost actor
+runs again elsewhere. Nothing is left on a cluster but Ray itself.
+"""
+
+import contextlib
+import logging
+import math
+import os
+import pickle
+import secrets
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from experiments.run import shipping
+from experiments.run.provenance import COMPUTING
+from experiments.run.ray_worker import CHILD_DIED, OTHER_ID, about, actor_class, packed
+from experiments.run.worker_process import (
+    DIED,
+    PATIENCE,
+    Failed,
+    Files,
+    Folder,
+    Identity,
+    Machine,
+    Result,
+    Run,
+    Spec,
+)
+from trajectories.arguments import shortened
+
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    # All of what Ray prints about other processes, such as the log of a node that was lost.
+    "RAY_DEDUP_LOGS_SKIP_REGEX": ".",
+}
+"""Environment that keeps Ray's own messages off the screen, and a local Ray on this computer."""
+STORE = 2**29
+"""Memory for objects of a local Ray, bytes; more goes to disk."""
+TURN = 1.0
+"""Time between looks at the nodes, s."""
+MOST_LOSSES = 5
+"""Losses of its actor after which a spec has failed."""
+MOST_STARTING = 60.0
+"""Time without a new actor after which a sweep that has none ends when one fails to start, s."""
+SAID = 20.0
+"""Time without any actor after which the user is told, s."""
+LOST = f"the worker that ran it was lost, {MOST_LOSSES} times"
+COPIED = 60.0
+"""Time between copies of the folder of a run that lasts, s."""
+RETURNED = 30.0
+"""Longest wait for the folders of interrupted runs, s."""
+
+
+def run_on_ray(
+    specs: Sequence[Spec],
+    workers: int | None,
+    address: str | None,
+    run: Run,
+    failed: Failed,
+    *,
+    started: Callable[[Spec], None] | None,
+    limit: float,
+    files: Files | None,
+    folder: Folder | None,
+    identity: Identity | None,
+    machine: Machine | None,
+) -> Iterator[Result]:
+    """Run specs on a Ray cluster and yield results as they end; see `Engine.run` of `engines`.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If Ray is not installed.
+    ValueError
+        If the cluster cannot be reached, or all of its nodes refuse the specs.
+    """
+    with connected(workers, address):
+        task = _Task(run, failed, limit, files, folder, identity, machine)
+        sweep = _Sweep(specs, workers, task, started or (lambda _: None))
+        try:
+            while sweep.unfinished:
+                yield from sweep.turn()
+        finally:
+            sweep.end()
+
+
+@contextlib.contextmanager
+def connected(workers: int | None, address: str | None) -> Iterator[None]:
+    """Connect to a cluster, or start a Ray on this computer; it ends with the context.
+
+    Where this process uses a Ray already, that one is used.
+    """
+    os.environ.update({key: value for key, value in QUIET.items() if key not in os.environ})
+    try:
+        import ray
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "--engine ray needs ray: pip install 'lpv-track-env[ray]'"
+        ) from None
+    if ray.is_initialized():
+        yield
+        return
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
+    if address is None:
+        options |= {
+            "address": "local", "num_cpus": workers or os.cpu_count() or 1,
+            "include_dashboard": False, "object_store_memory": STORE,
+        }  # fmt: skip
+    else:
+        options["address"] = address
+    try:
+        ray.init(**options)
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = shortened(error)
+        raise ValueError(
+            "Ray cannot be started on this computer: " + reason
+            if address is None
+            else f"no Ray cluster that can be used at {address} ({reason}): start one with ray "
+            "start --head, and run the command on a computer of it"
+        ) from None
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+@dataclass(frozen=True)
+class _Task:
+    """All that the specs of a sweep have in common."""
+
+    run: Run
+    failed: Failed
+    limit: float
+    files: Files | None
+    folder: Folder | None
+    identity: Identity | None
+    machine: Machine | None
+
+
+@dataclass(eq=False)
+class _Hand:
+    """An actor and what it is at: saying hello, idle, or the spec of a number."""
+
+    actor: Any
+    at: Any
+    """Reference to what it answers; None if it is idle."""
+    node: str | None = None
+    address: str = ""
+    number: int | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+    folder: Path | None = None
+    """Folder of the spec, which travels there and back."""
+    known: dict[str, str] = field(default_factory=dict)
+    """Digests of the files that the folder holds here, as far as they travelled."""
+    copy: Any = None
+    """Reference to changes in the folder."""
+    copied: float = 0.0
+    """When they were asked for, s."""
+    token: Path | None = None
+    """File by which the actor sees that it has the folder itself."""
+
+
+class _Sweep:
+    """Specs of a sweep, and the actors that run them."""
+
+    def __init__(
+        self,
+        specs: Sequence[Spec],
+        workers: int | None,
+        task: _Task,
+        started: Callable[[Spec], None],
+    ) -> None:
+        import ray
+
+        self._ray, self._class = ray, actor_class()
+        self._specs, self._most, self._task, self._started = specs, workers, task, started
+        self._fresh = list(reversed(range(len(specs))))
+        self._suspects: list[int] = []
+        """Specs that run alone on a computer: one of them may bring a worker down."""
+        self._deaths: Counter[int] = Counter()
+        self._losses: Counter[int] = Counter()
+        self._hands: list[_Hand] = []
+        self._begun: set[int] = set()
+        self._refused: dict[str, str] = {}
+        self._looked, self._greeted = -math.inf, time.monotonic()
+        self._said = False
+        self._call = packed(task.run, task.identity)
+        self._here = about()
+        self._machines = {self._here["key"]}
+        self._objects: dict[str, Any] = {}
+        """Contents of files on the cluster, by digest."""
+
+    @property
+    def _busy(self) -> list[_Hand]:
+        return [hand for hand in self._hands if hand.number is not None]
+
+    @property
+    def unfinished(self) -> bool:
+        """True while a spec waits or runs."""
+        return bool(self._fresh or self._suspects or self._busy)
+
+    def turn(self) -> list[Result]:
+        """Recruit actors, give them specs, and return the results that there are."""
+        if time.monotonic() - self._looked > TURN:
+            self._recruit()
+            self._copy_folders()
+            self._say_waiting()
+            self._looked = time.monotonic()
+        self._assign()
+        waiting = {hand.at: hand for hand in self._hands if hand.at is not None}
+        copies = {hand.copy: hand for hand in self._hands if hand.copy is not None}
+        everything = [*copies, *waiting]
+        if not everything:
+            time.sleep(TURN)
+            return []
+        self._ray.wait(everything, num_returns=1, timeout=TURN)
+        ready, _ = self._ray.wait(everything, num_returns=len(everything), timeout=0)
+        results: list[Result] = []
+        for reference in sorted(ready, key=everything.index):
+            if reference in copies:
+                self._take_copy(copies[reference])
+            else:
+                results += self._hear(waiting[reference])
+        # Whoever reads the results may take his time.
+        self._assign()
+        return results
+
+    # Actors ---------------------------------------------------------------------------------------
+
+    def _recruit(self) -> None:
+        """Ask for as many actors as can be used, on nodes that have not refused."""
+        nodes = {one["NodeID"]: one for one in self._ray.nodes() if one["Alive"]}
+        good = [one for key, one in nodes.items() if key not in self._refused]
+        if not good and self._refused:
+            raise ValueError(
+                f"no node of the Ray cluster can be used: {[*self._refused.values()][-1]}"
+            )
+        cpus = int(sum(one["Resources"].get("CPU", 0) for one in good))
+        waiting = len(self._fresh) + len(self._suspects) + len(self._busy)
+        options: dict[str, Any] = {"scheduling_strategy": "SPREAD"}
+        if self._refused:
+            options["label_selector"] = {"ray.io/node-id": f"!in({','.join(self._refused)})"}
+        while len(self._hands) < min(self._most or cpus, waiting):
+            actor = self._class.options(**options).remote()  # type: ignore[attr-defined]
+            self._hands.append(_Hand(actor, actor.hello.remote()))
+
+    def _say_waiting(self) -> None:
+        """Say once that nothing runs for want of a free CPU."""
+        late = time.monotonic() - self._greeted > SAID
+        if late and not self._said and not any(one.node for one in self._hands):
+            self._said = True
+            warnings.warn("waiting for a free CPU of the Ray cluster", UserWarning, stacklevel=2)
+
+    def _drop(self, hand: _Hand) -> None:
+        self._hands.remove(hand)
+        self._ray.kill(hand.actor)
+
+    def _refuse(self, hand: _Hand, reason: str) -> None:
+        """Use the node of a hand no more, and say so."""
+        assert hand.node is not None
+        line = f"node {hand.address} refuses: {reason}"
+        if hand.node not in self._refused:
+            warnings.warn(line, UserWarning, stacklevel=2)
+        self._refused[hand.node] = line
+        # Its others are at work that they have accepted, or will refuse likewise.
+        self._drop(hand)
+
+    def _greet(self, hand: _Hand, there: Mapping[str, Any]) -> None:
+        """Take a hand that has said hello on, if it would compute the same."""
+        hand.node, hand.address, hand.at = there["node"], there["address"], None
+        hand.versions = there.get("versions", {})
+        self._greeted = time.monotonic()
+        if hand.node in self._refused:
+            self._drop(hand)
+        elif reason := self._difference(there):
+            self._refuse(hand, reason)
+        elif there["key"] not in self._machines:
+            self._machines.add(there["key"])
+            if self._task.machine is not None:
+                self._task.machine({"key": there["key"], **there["provenance"]})
+
+    def _difference(self, there: Mapping[str, Any]) -> str | None:
+        """Return why a worker does not compute the same; None if it does."""
+        if "missing" in there:
+            return f"lpv-track-env cannot be loaded there ({shortened(there['missing'], 120)})"
+        here, own = self._here["sources"], there["sources"]
+        if here != own:
+            return (
+                f"other sources (digest {own} there, {here} here): install the same version of "
+                "lpv-track-env there"
+            )
+        # The versions of optional packages are part of the ids of cases that use them.
+        optional = self._task.identity is None
+        changed = self._changed(there["versions"], None if optional else COMPUTING)
+        return f"other versions ({changed}): install the same there" if changed else None
+
+    def _changed(self, there: Mapping[str, str], only: Sequence[str] | None = None) -> str:
+        """Return the first versions that differ, in words; "" if there are none."""
+        here = self._here["versions"]
+        names = {*here, *there} if only is None else {"python", "machine", *only}
+        return "; ".join(
+            f"{name} {there.get(name, 'missing')} there, {here.get(name, 'missing')} here"
+            for name in sorted(names)
+            if here.get(name) != there.get(name)
+        )[:150]
+
+    # Specs ----------------------------------------------------------------------------------------
+
+    def _assign(self) -> None:
+        """Give specs to idle actors."""
+        for hand in [one for one in self._hands if one.at is None]:
+            if hand.node in self._refused:
+                self._drop(hand)
+            elif self._fresh:
+                self._give(hand, self._fresh.pop())
+            elif self._suspects and hand.node not in {one.node for one in self._busy}:
+                self._give(hand, self._suspects.pop())
+
+    def _give(self, hand: _Hand, number: int) -> None:
+        spec, task = self._specs[number], self._task
+        order: dict[str, Any] = {
+            "call": self._call,
+            "spec": pickle.dumps(spec),
+            "id": None if task.identity is None else task.identity(spec),
+            "limit": task.limit,
+        }
+        named = () if task.files is None else shipping.with_weights(task.files(spec))
+        found = shipping.contents(named)
+        order["files"] = shipping.digests(found)
+        given = {
+            name: self._object(order["files"][name], content)
+            for name, content in found.items()
+            if not Path(name).is_absolute()
+        }
+        folder = None if task.folder is None else task.folder(spec)
+        content, hand.folder = None, None
+        if folder is not None and folder.is_absolute():
+            hand.token = folder / f".here.{secrets.token_hex(4)}.tmp"
+            folder.mkdir(parents=True, exist_ok=True)
+            hand.token.touch()
+            order["token"] = str(hand.token)
+        elif folder is not None:
+            content = dict(shipping.changes(folder, {}).files)
+            hand.folder, hand.known = folder, shipping.digests(content)
+            hand.copied = time.monotonic()
+            order["folder"], order["known"] = str(folder), hand.known
+        hand.number, hand.at = number, hand.actor.run.remote(order, given, content)
+        if number not in self._begun:
+            self._begun.add(number)
+            self._started(spec)
+
+    def _object(self, digest: str, content: bytes) -> Any:
+        if digest not in self._objects:
+            self._objects[digest] = self._ray.put(content)
+        return self._objects[digest]
+
+    def _hear(self, hand: _Hand) -> list[Result]:
+        """Take what an actor answers; return the result, if that is one."""
+        try:
+            answer = self._ray.get(hand.at)
+        except self._ray.exceptions.RayTaskError as error:
+            answer = {
+                "kind": "refused",
+                "content": f"{type(error.cause).__name__}: {shortened(error.cause)}",
+            }
+        except self._ray.exceptions.RayError as error:
+            return self._lose(hand, shortened(error))
+        if hand.number is None:
+            self._greet(hand, answer)
+            return []
+        number = self._finish(hand)
+        if answer["kind"] == "refused":
+            self._fresh.append(number)
+            reason = answer["content"]
+            if reason == OTHER_ID:
+                reason += f" ({self._changed(hand.versions) or 'a module of its own differs'})"
+            self._refuse(hand, reason)
+            return []
+        if "changes" in answer:
+            self._apply(hand, answer["changes"])
+        return self._result(number, answer)
+
+    def _finish(self, hand: _Hand) -> int:
+        """Free a hand of its spec, and return that one's number."""
+        assert hand.number is not None
+        number, hand.number, hand.at, hand.copy = hand.number, None, None, None
+        if hand.token is not None:
+            hand.token.unlink(missing_ok=True)
+            hand.token = None
+        return number
+
+    def _result(self, number: int, answer: Mapping[str, Any]) -> list[Result]:
+        spec, failed = self._specs[number], self._task.failed
+        if answer["kind"] == "raised":
+            raise pickle.loads(answer["content"])[1]  # noqa: S301  from a worker of our own
+        if answer["kind"] == "failed":
+            return [failed(spec, answer["content"])]
+        if answer["kind"] == CHILD_DIED:
+            self._deaths[number] += 1
+            if self._deaths[number] > 1:
+                return [failed(spec, DIED)]
+            self._suspects.append(number)
+            return []
+        return [pickle.loads(answer["content"])]  # noqa: S301  from a worker of our own
+
+    def _lose(self, hand: _Hand, reason: str) -> list[Result]:
+        """Forget an actor that was lost; its spec runs again elsewhere."""
+        self._hands.remove(hand)
+        if hand.number is None:
+            lately = time.monotonic() - self._greeted < MOST_STARTING
+            if not lately and not any(one.node for one in self._hands):
+                raise ValueError(f"Ray cannot start workers: {reason}")
+            return []
+        number = self._finish(hand)
+        self._losses[number] += 1
+        if self._losses[number] == MOST_LOSSES:
+            return [self._task.failed(self._specs[number], LOST)]
+        (self._fresh if self._losses[number] == 1 else self._suspects).append(number)
+        return []
+
+    # Folders --------------------------------------------------------------------------------------
+
+    def _copy_folders(self) -> None:
+        """Ask for the folders of runs that last, so that not all is lost with an actor."""
+        now = time.monotonic()
+        for hand in self._busy:
+            if hand.folder is not None and hand.copy is None and now - hand.copied > COPIED:
+                hand.copied = now
+                hand.copy = hand.actor.changes.remote(str(hand.folder), hand.known)
+
+    def _take_copy(self, hand: _Hand) -> None:
+        reference, hand.copy = hand.copy, None
+        # An actor that was lost is noticed by what it runs.
+        with contextlib.suppress(self._ray.exceptions.RayError):
+            self._apply(hand, self._ray.get(reference))
+
+    def _apply(self, hand: _Hand, changed: shipping.Changes) -> None:
+        assert hand.folder is not None
+        hand.known = shipping.apply(hand.folder, changed, hand.known)
+
+    def end(self) -> None:
+        """End all actors; folders of interrupted runs are brought back before."""
+        away = [hand for hand in self._busy if hand.folder is not None]
+        for hand in away:
+            hand.actor.end.remote()
+        if away:
+            self._ray.wait([hand.at for hand in away], num_returns=len(away), timeout=RETURNED)
+        for hand in away:
+            with contextlib.suppress(self._ray.exceptions.RayError):
+                answer = self._ray.get(hand.at, timeout=0)
+                if "changes" in answer:
+                    self._apply(hand, answer["changes"])
+        for hand in self._busy:
+            self._finish(hand)
+        closed = [hand.actor.close.remote() for hand in self._hands if hand.node is not None]
+        if closed:
+            self._ray.wait(closed, num_returns=len(closed), timeout=PATIENCE)
+        for hand in [*self._hands]:
+            self._drop(hand)
