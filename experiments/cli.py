@@ -21,6 +21,8 @@ COMMANDS = {
     "benchmark": "Run agents x trajectories x seeds, print the paper's table, write report.html.",
     "report": "Rebuild the table and report.html from saved cases alone.",
     "leaderboard": "Build one page and Markdown of result folders; a sample of each row is rerun.",
+    "compare": "Compare folders of results, or agents within one, drive by drive: table, LaTeX, "
+    "figures.",
     "drive": "Watch a run live, or write its frames or a video; several agents side by side.",
     "trajectories": "Read paths and files, print the paper's rows of them, draw and write them.",
     "limits": "Compute the physical limits of lane changes and laps by optimal control.",

@@ -333,6 +333,16 @@ def current(cases: Iterable[Result]) -> list[Result]:
     return list(latest.values())
 
 
+def drive_of(case: Result) -> str:
+    """Return the digest of all that determines a drive except its agent.
+
+    Entries that an old result lacks are the default.
+    """
+    names = (*(name for name in USUAL if name not in ("agent", "agent_settings")), "scene")
+    given = json.dumps([case.get(name) or USUAL.get(name) for name in names], sort_keys=True)
+    return hashlib.blake2b(given.encode(), digest_size=16).hexdigest()
+
+
 def _rank(known: Sequence[str]) -> Callable[[str], tuple[int, str]]:
     places = {name: place for place, name in enumerate(known)}
     return lambda name: (places.get(name, len(places)), name)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run.compare import EXAMPLE, main
+from experiments.cli import main
 from experiments.run.exact import compare, values_of
 from tests.helpers.made_results import METRICS, case, folder_of
 
@@ -20,7 +20,7 @@ def test_equal_results_have_no_difference(
     ]
     folder_of(tmp_path / "a", first, traces=False)
     folder_of(tmp_path / "b", second, traces=False)
-    assert main([str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    assert main(["compare", "--exact", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
     said = capsys.readouterr().out
     assert "2 cases in both" in said
     assert "no differences" in said
@@ -44,7 +44,7 @@ def test_the_last_digit_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert [line.split(": ")[1] for line in found.differences] == [
         "end finished -> left", f"metrics.ale 0.08 -> {0.08 + 2**-53}",
     ]  # fmt: skip
-    assert main([str(tmp_path / "a"), str(tmp_path / "b")]) == 1
+    assert main(["compare", "--exact", str(tmp_path / "a"), str(tmp_path / "b")]) == 1
     assert "2 differences" in capsys.readouterr().out
 
 
@@ -90,12 +90,8 @@ def test_searches_that_tried_other_values_are_one_case(tmp_path: Path) -> None:
 
 def test_no_results_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder_of(tmp_path / "a", [case(1)], traces=False)
-    assert main([str(tmp_path / "a"), str(tmp_path / "none")]) == 2
-    assert f"no results in {tmp_path / 'none'}" in capsys.readouterr().out
+    assert main(["compare", "--exact", str(tmp_path / "a"), str(tmp_path / "none")]) == 2
+    assert f"no results in {tmp_path / 'none'}" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
-
-
-def test_help_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["--help"])
-    assert EXAMPLE in capsys.readouterr().out
+    assert main(["compare", "--exact", str(tmp_path / "a")]) == 2
+    assert "two folders, not 1" in capsys.readouterr().err
