@@ -1,11 +1,7 @@
 """Ranking of agents over the regimes of a suite, drive by drive."""
 
-<<<<<<< HEAD
 import json
 from collections.abc import Iterable, Mapping, Sequence
-=======
-from collections.abc import Iterable, Sequence
->>>>>>> aaa65a4 (lpv-track compare: folders or agents drive by drive, with bootstrap intervals, LaTeX and figures)
 from typing import NamedTuple
 
 import numpy as np
@@ -14,11 +10,7 @@ from scipy.stats import rankdata
 
 from experiments.run import regimes
 from experiments.run.statistics import CONFIDENCE, RESAMPLES, rate_interval
-<<<<<<< HEAD
 from experiments.run.tables import USUAL, Result, by_label
-=======
-from experiments.run.tables import Result, drive_of, label_of, labels
->>>>>>> aaa65a4 (lpv-track compare: folders or agents drive by drive, with bootstrap intervals, LaTeX and figures)
 
 Array = NDArray[np.float64]
 
@@ -109,7 +101,6 @@ def _losses(group: Mapping[str, Sequence[Result]], names: Sequence[str]) -> Arra
     The loss is the first figure of the regime, or 1 over it where larger is better; inf in a drive
     that failed.
     """
-<<<<<<< HEAD
     column = regimes.columns_of(case for cases in group.values() for case in cases)[0]
     found: dict[str, dict[str, list[float]]] = {}
     for name, cases in group.items():
@@ -119,22 +110,11 @@ def _losses(group: Mapping[str, Sequence[Result]], names: Sequence[str]) -> Arra
                 figure = 1.0 / figure if figure > 0.0 else None
             drive = found.setdefault(drive_of(case), {})
             drive.setdefault(name, []).append(np.inf if figure is None else figure)
-=======
-    column = regimes.columns_of(group)[0]
-    found: dict[str, dict[str, float]] = {}
-    for case in group:
-        figure = regimes.figure(case, column) if regimes.passed(case) else None
-        if figure is not None and column.key in LARGER_IS_BETTER:
-            figure = 1.0 / figure
-        drive = found.setdefault(drive_of(case), {})
-        drive[label_of(case)] = np.inf if figure is None else figure
->>>>>>> aaa65a4 (lpv-track compare: folders or agents drive by drive, with bootstrap intervals, LaTeX and figures)
     shared = [drive for drive in found.values() if len(drive) == len(names)]
     whole = [[float(np.median(drive[name])) for name in names] for drive in shared]
     return np.array(whole, dtype=np.float64).reshape(-1, len(names))
 
 
-<<<<<<< HEAD
 def drive_of(case: Result) -> str:
     """Return all that determines a drive except its agent, as text.
 
@@ -144,8 +124,6 @@ def drive_of(case: Result) -> str:
     return json.dumps(values, sort_keys=True)
 
 
-=======
->>>>>>> aaa65a4 (lpv-track compare: folders or agents drive by drive, with bootstrap intervals, LaTeX and figures)
 def _resampled_means(ranks: Array, random: np.random.Generator) -> Array:
     """Return mean ranks of resampled drives, (RESAMPLES, agents).
 
