@@ -1,6 +1,5 @@
 """Drives that a report draws: cases with their traces, grouped by setting and by conditions."""
 
-import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 import trajectories
 from experiments.report.page import first_open
 from experiments.run import tables
+from experiments.run.foreign import is_path_file
 from experiments.run.store import ResultStore
 from experiments.run.tables import Result, Setting
 from lpv_track_env import vehicle
@@ -29,8 +29,6 @@ TRACE = (
 """Arrays that a trace must hold to be drawn."""
 LEAD = "lpv-nmpc"
 """Agent whose figures come first, if it has driven."""
-MADE = re.compile(r"(random(-fast|-limit)?|circuit)-\d{1,18}|iso-3888-[12]-\d{1,4}(\.\d{1,8})?")
-"""Names of random paths, circuits and lane changes, which no file stands behind."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +58,7 @@ class NamedFiles:
 
     def closed_path(self, trajectory: str) -> bool:
         """Return whether a trajectory is a file that may not be opened."""
-        named = trajectory in trajectories.names() or MADE.fullmatch(trajectory) is not None
-        return not named and not self._may_open(trajectory)
+        return is_path_file(trajectory) and not self._may_open(trajectory)
 
     def closed_vehicle(self, vehicle: str) -> bool:
         """Return whether a vehicle is a file that may not be opened."""

@@ -184,7 +184,7 @@ def _run(
 
 def named_files(spec: Spec, kind: type[BaseCase] = Case) -> list[Path]:
     """Return the files that a case reads, beside the project's sources."""
-    return [file for file in kind(**spec).files() if file is not None and file.is_file()]
+    return kind(**spec).present_files()
 
 
 def case_id(spec: Spec, kind: type[BaseCase] = Case) -> str:

@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import inspect
 import json
+import os
 import signal
 import time
 import warnings
@@ -78,9 +79,7 @@ class BaseCase(ABC):
 
         Other versions of NumPy or Numba change the last digits of a result, as other sources may.
         """
-        digests = [
-            file_digest(file) for file in self.files() if file is not None and file.is_file()
-        ]
+        digests = [file_digest(file) for file in self.present_files()]
         versions = computing_versions(*self.packages())
         content = json.dumps([self.as_dict(), digests, project_digest(), versions], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
@@ -99,6 +98,11 @@ class BaseCase(ABC):
             # A setting may name a checkpoint that is shipped beside the agent's default.
             *(CHECKPOINTS / f"{self.agent}-{value}.json" for value in settings),
         ]
+
+    def present_files(self) -> list[Path]:
+        """Return those of `files` that are there."""
+        # Path.is_file raises for names that no file can have.
+        return [file for file in self.files() if file is not None and os.path.isfile(file)]  # noqa: PTH113
 
     @property
     def reset_options(self) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -130,15 +130,70 @@ def manifest_key() -> str:
 
 def version_changes(before: Mapping[str, Any]) -> list[str]:
     """Return where versions differ from a manifest's, as "numpy 2.1.0 instead of 2.2.0"."""
-    then, now = before.get("versions"), versions()
-    if not isinstance(then, Mapping):
-        return []
-    names = [name for name in now if name in ("python", *COMPUTING, *OPTIONAL)]
-    return [
-        f"{name} {then[name]} instead of {now[name]}"
-        for name in names
-        if name in then and then[name] != now[name]
+    changed = _changed_versions(before, ("python", *COMPUTING, *OPTIONAL))
+    return [f"{name} {then} instead of {now}" for name, then, now in changed if then and now]
+
+
+def changes_since(before: Mapping[str, Any], packages: Sequence[str]) -> dict[str, list[str]]:
+    """Return in words what differs here from a manifest: `versions`, `sources`, `processor`.
+
+    What the manifest does not tell counts as different. Versions are those of `packages`; Python
+    counts by its minor version.
+    """
+    changed = _changed_versions(before, ("python", *packages))
+    versions = [
+        f"{name} {then or 'none'} there, {now or 'none'} here"
+        for name, then, now in changed
+        if name != "python" or _minor(then) != _minor(now)
     ]
+    found = {"versions": versions, "sources": [], "processor": []}
+    if not isinstance(before.get("versions"), Mapping):
+        found["versions"] = ["versions not known"]
+    there = _entry(before, "revision")
+    if not (there.get("sources") or there.get("commit")):
+        found["sources"] = ["sources not known"]
+    elif there.get("sources") != project_digest():
+        found["sources"] = [f"sources {_sources(there)} there, {_sources(revision())} here"]
+    there, (name, features) = _entry(before, "hardware"), processor_features()
+    known = there.get("features")
+    if not isinstance(known, list):
+        found["processor"] = ["processor features not known"]
+    elif there.get("architecture") != name or set(map(str, known)) != set(features):
+        words = [f"processor {there.get('architecture')} there, {name} here"]
+        for place, more, less in (("there", known, features), ("here", features, known)):
+            if only := [one for one in map(str, more) if one not in less]:
+                words.append(f"with {' '.join(only)} only {place}")
+        found["processor"] = [" ".join(words)]
+    return found
+
+
+def _changed_versions(
+    before: Mapping[str, Any], names: Sequence[str]
+) -> list[tuple[str, Any, str | None]]:
+    """Return name, version in a manifest and version here of the packages where they differ."""
+    then, now = _entry(before, "versions"), versions()
+    return [
+        (name, then.get(name), now.get(name)) for name in names if then.get(name) != now.get(name)
+    ]
+
+
+def _entry(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    found = manifest.get(name)
+    return found if isinstance(found, Mapping) else {}
+
+
+def _minor(version: object) -> list[str]:
+    return str(version).split(".")[:2]
+
+
+def _sources(told: Mapping[str, Any]) -> str:
+    """Say which sources a manifest's `revision` tells of."""
+    words = [str(told["sources"])] if told.get("sources") else []
+    if told.get("commit"):
+        words.append(
+            f"(commit {str(told['commit'])[:12]}{', modified' * bool(told.get('modified'))})"
+        )
+    return " ".join(words)
 
 
 def _installed(*packages: str) -> dict[str, str]:

@@ -29,6 +29,7 @@ Identity = Callable[[Spec], str]
 Machine = Callable[[Mapping[str, Any]], None]
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+LATE = "took longer than"
 DIED = "the worker process died, twice"
 PATIENCE = 5.0
 """Time that an idle worker has to end by itself, s."""
@@ -42,7 +43,7 @@ def one_thread() -> None:
 
 def late(limit: float) -> str:
     """Return the error of a run that took longer than the limit, s."""
-    return f"took longer than {limit:g} s"
+    return f"{LATE} {limit:g} s"
 
 
 def ready(busy: Sequence["Worker"], limit: float) -> list["Worker"]:

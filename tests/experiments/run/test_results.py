@@ -1,6 +1,7 @@
 """The folder of results survives what a killed run leaves, and says what it cannot read."""
 
 import json
+import subprocess
 
 import numpy as np
 import pytest
@@ -178,3 +179,34 @@ def test_lines_are_plain_json_with_sorted_keys(store):
     store.append(result("a", trace={"time": np.arange(2.0)}))
     line = store.cases_file.read_text()
     assert line == json.dumps(result("a"), sort_keys=True) + "\n"
+
+
+def test_a_commit_is_that_of_this_projects_checkout_alone(tmp_path, monkeypatch):
+    """A wheel may be installed inside another project's repository, which may even hold it."""
+
+    def git(*words):
+        identity = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+        call = ["git", "-C", str(tmp_path), *identity, *words]
+        return subprocess.run(call, check=True, capture_output=True, text=True).stdout.strip()
+
+    def revision_in(folder):
+        folder.mkdir(parents=True)
+        (folder / "provenance.py").touch()
+        monkeypatch.setattr(provenance, "HERE", folder)
+        return provenance.revision()
+
+    sources = {"sources": provenance.project_digest()}
+    git("init", "-q")
+    wheel = tmp_path / ".venv" / "site-packages" / "experiments" / "run"
+    checkout = tmp_path / "experiments" / "run"
+    assert revision_in(wheel) == sources
+    git("add", "-A")
+    git("commit", "-qm", "all")
+    assert provenance.revision() == sources
+    assert revision_in(checkout) == sources
+    git("add", "-A")
+    git("commit", "-qm", "more")
+    commit = git("rev-parse", "HEAD")
+    assert provenance.revision() == {**sources, "commit": commit, "modified": False}
+    (checkout / "provenance.py").write_text("# changed\n")
+    assert provenance.revision() == {**sources, "commit": commit, "modified": True}
