@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from experiments.run import regimes, suites
 from experiments.run.case import Case
-from experiments.run.ranking import drive_of
 from experiments.run.result_schema import read_driven
 from experiments.run.store import ResultStore
 from experiments.run.tables import (
     Result,
     by_label,
     current,
+    drive_of,
     path_names,
     setting_of,
     training_of,

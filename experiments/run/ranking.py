@@ -1,6 +1,5 @@
 """Ranking of agents over the regimes of a suite, drive by drive."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -10,7 +9,7 @@ from scipy.stats import rankdata
 
 from experiments.run import regimes
 from experiments.run.statistics import CONFIDENCE, RESAMPLES, rate_interval
-from experiments.run.tables import USUAL, Result, by_label
+from experiments.run.tables import Result, by_label, drive_of
 
 Array = NDArray[np.float64]
 
@@ -28,10 +27,10 @@ LARGER_IS_BETTER = ("highest_fixed_speed",)
 """First figures of a regime of which the largest is the best."""
 
 
-DRIVE = tuple(
-    (name, usual) for name, usual in USUAL.items() if name not in {"agent", "agent_settings"}
-)
-"""Entries of a result that determine its drive, each with its default."""
+LEAST_RESAMPLES, MOST_DRAWN = 1000, 50_000_000
+"""Of many drives fewer resamples are drawn, so that all of them have at most so many drives."""
+MOST_AT_ONCE = 4_000_000
+"""Most counts that are in memory at once."""
 
 
 class Place(NamedTuple):
@@ -77,8 +76,9 @@ def ranked(groups: Sequence[Mapping[str, Sequence[Result]]], *, seed: int = 0) -
         return []
     ranks = [rankdata(found, axis=1) for found in losses]
     random = np.random.default_rng(seed)
+    resamples = min(RESAMPLES, max(LEAST_RESAMPLES, MOST_DRAWN // max(map(len, ranks))))
     drawn = np.mean(
-        [_resampled_means(found, random) for found in ranks], axis=0
+        [_resampled_means(found, random, resamples) for found in ranks], axis=0
     )  # (resamples, entries)
     low, high = np.quantile(drawn, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2], axis=0)
     mean = np.mean([found.mean(axis=0) for found in ranks], axis=0)
@@ -115,22 +115,18 @@ def _losses(group: Mapping[str, Sequence[Result]], names: Sequence[str]) -> Arra
     return np.array(whole, dtype=np.float64).reshape(-1, len(names))
 
 
-def drive_of(case: Result) -> str:
-    """Return all that determines a drive except its agent, as text.
-
-    Entries that an old result lacks are the default.
-    """
-    values = [usual if (value := case.get(name)) is None else value for name, usual in DRIVE]
-    return json.dumps(values, sort_keys=True)
-
-
-def _resampled_means(ranks: Array, random: np.random.Generator) -> Array:
-    """Return mean ranks of resampled drives, (RESAMPLES, agents).
+def _resampled_means(ranks: Array, random: np.random.Generator, resamples: int) -> Array:
+    """Return mean ranks of resampled drives, (resamples, entries).
 
     A resample counts how often each drive is drawn.
     """
-    counts = random.multinomial(len(ranks), np.full(len(ranks), 1.0 / len(ranks)), RESAMPLES)
-    means: Array = counts @ ranks / len(ranks)
+    drives = len(ranks)
+    even = np.full(drives, 1.0 / drives)
+    step = max(1, MOST_AT_ONCE // drives)
+    sizes = [min(step, resamples - done) for done in range(0, resamples, step)]
+    means: Array = np.concatenate(
+        [random.multinomial(drives, even, size) @ ranks / drives for size in sizes]
+    )
     return means
 
 

@@ -129,7 +129,7 @@ def _line(label: str, cases: Sequence[Result], columns: tuple[Mean, ...]) -> Lin
 
 def passed(case: Result) -> bool:
     """Return whether the drive of a case did what its regime asks for."""
-    return case.get("status") == "ok" and passes(case)
+    return case.get("status") == "ok" and "end" in case and passes(case)
 
 
 def figure(case: Result, column: Mean) -> float | None:
