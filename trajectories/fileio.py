@@ -5,13 +5,15 @@ read. JSON must be UTF-8 with finite numbers, each key once, and little nesting.
 ValueError of one line that begins with the file's name.
 """
 
+import contextlib
 import json
 import math
 import os
 import secrets
 import stat
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, BinaryIO, NoReturn, TypeVar
 
 import msgspec
 
@@ -46,22 +48,38 @@ def read_bytes(file: str | Path, limit: int = MOST_BYTES) -> bytes:
         In one line that begins with the file's name, for a pipe, device, folder, a larger file, or
         one that cannot be read.
     """
+    with opened(file) as handle:
+        size = os.fstat(handle.fileno()).st_size
+        # A file may grow meanwhile; memory for all that is allowed is not reserved.
+        content = handle.read(min(size, limit) + 1)
+    if (size := max(size, len(content))) > limit:
+        raise ValueError(f"{shortened(file)}: {size} bytes are too many: at most {limit} are read")
+    return content
+
+
+@contextlib.contextmanager
+def opened(file: str | Path) -> Iterator[BinaryIO]:
+    """Open a regular file to read its bytes, for files that are too large for memory.
+
+    Raises
+    ------
+    ValueError
+        In one line that begins with the file's name, for a pipe, device, folder, or a file that
+        cannot be read, then or in the context.
+    """
     name = shortened(file)
     try:
-        with open(file, "rb", opener=_opened) as handle:
-            status = os.fstat(handle.fileno())
-            regular = stat.S_ISREG(status.st_mode)
-            # A file may grow meanwhile; memory for all that is allowed is not reserved.
-            size = min(status.st_size, limit)
-            content = handle.read(size + 1) if regular else b""
+        handle = open(file, "rb", opener=_opened)
     except (OSError, ValueError) as error:  # ValueError: the name holds a NUL or half a surrogate
         reason = getattr(error, "strerror", None) or shortened(error)
         raise ValueError(f"{name}: cannot be read: {reason}") from error
-    if not regular:
-        raise ValueError(f"{name}: cannot be read: it is a pipe or device, no regular file")
-    if (size := max(status.st_size, len(content))) > limit:
-        raise ValueError(f"{name}: {size} bytes are too many: at most {limit} are read")
-    return content
+    with handle:
+        if not stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
+            raise ValueError(f"{name}: cannot be read: it is a pipe or device, no regular file")
+        try:
+            yield handle
+        except OSError as error:
+            raise ValueError(f"{name}: cannot be read: {error.strerror}") from error
 
 
 def _opened(file: str, flags: int) -> int:

@@ -203,7 +203,7 @@ def label(spec: Spec) -> str:
 
 def selected(
     store: ResultStore, specs: Sequence[Spec], kind: type[BaseCase] = Case
-) -> list[dict[str, Any]]:
+) -> list[Mapping[str, Any]]:
     """Return the results of some specs, in their order."""
     by_id = {case["id"]: case for case in store.cases([])}
     return [by_id[key] for spec in specs if (key := kind(**spec).id) in by_id]

@@ -14,6 +14,7 @@ from experiments.run.benchmark import run_benchmark
 from experiments.run.case import Case
 from experiments.run.engines import Engine
 from experiments.run.provenance import computing_versions, manifest_key
+from experiments.run.result_schema import plain
 from experiments.run.store import ResultStore
 from experiments.run.traffic import TrafficCase
 
@@ -97,7 +98,7 @@ def test_a_folder_of_an_earlier_version_of_the_project_is_read_and_gone_on_with(
     tmp_path: Path,
 ) -> None:
     sweep(tmp_path)
-    (case,) = ResultStore(tmp_path).cases()
+    case = plain(*ResultStore(tmp_path).cases(), "case")
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     del case["manifest"], manifest["key"]
     (tmp_path / "cases.jsonl").write_text(json.dumps({**case, "id": "0123456789abcdef"}) + "\n")
