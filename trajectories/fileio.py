@@ -69,7 +69,7 @@ def opened(file: str | Path) -> Iterator[BinaryIO]:
     """
     name = shortened(file)
     try:
-        handle = open(file, "rb", opener=_opened)
+        handle = open(file, "rb", opener=_opened)  # noqa: SIM115  closed below
     except (OSError, ValueError) as error:  # ValueError: the name holds a NUL or half a surrogate
         reason = getattr(error, "strerror", None) or shortened(error)
         raise ValueError(f"{name}: cannot be read: {reason}") from error

@@ -138,35 +138,32 @@ def read_case(line: bytes, name: str) -> Case:
     """
     if len(line) > LONGEST_LINE:
         raise ValueError(f"{name}: is longer than {LONGEST_LINE} bytes")
-    case: Case = _harmless(line)
+    case = _harmless(line)
     if case is None:
-        case = parse_json(line, name)
+        case = checked(parse_json(line, name), Case, name)
         if any(CONTROL.search(text) for text in _texts(case)):
             raise ValueError(f"{name}: holds characters that cannot be printed")
     checked(case, Stored, name)
     return case
 
 
-def _harmless(line: bytes) -> Any:
+def _harmless(line: bytes) -> Case | None:
     """Decode a line that surely passes `parse_json` and holds no `CONTROL`; None for any other.
 
     Without escapes, ASCII that is JSON holds no such characters. Brackets bound the depth. As many
     colons as keys and texts have mean that no key stands twice.
     """
-    if not line.isascii() or b"\\" in line or b"\x7f" in line:
-        return None
-    if line.count(b"{") + line.count(b"[") > DEEPEST:
+    printable = line.isascii() and b"\\" not in line and b"\x7f" not in line
+    if not printable or line.count(b"{") + line.count(b"[") > DEEPEST:
         return None
     try:
-        found = msgspec.json.decode(line)
+        found: Case = msgspec.json.decode(line, type=dict)
     except msgspec.MsgspecError:
-        return None
-    if type(found) is not dict:
         return None
     keys = 0
     outer: list[Any] = [found]
     for value in outer:
-        is_object = type(value) is dict
+        is_object = isinstance(value, dict)
         keys += len(value) if is_object else 0
         for inner in value.values() if is_object else value:
             kind = type(inner)
