@@ -9,6 +9,8 @@ from experiments.commands import options as shared
 
 EXAMPLE = "lpv-track leaderboard results/benchmark results/limits --out build/leaderboard"
 SAMPLE = 5
+MOST_LINES = 10
+"""Most lines about what cannot be read."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -41,14 +43,19 @@ def run(options: argparse.Namespace, console: Console) -> int:
     sections = sections_of(options.folders, skipped)
     rows = [row for section in sections for row in section.rows]
     if not rows:
-        raise ValueError(skipped[0])
-    for line in skipped:
+        raise ValueError(skipped[1] if len(skipped) > 1 else skipped[0])
+    for line in skipped[:MOST_LINES]:
         console.print(f"left out: {line}", markup=False, style="red")
+    if len(skipped) > MOST_LINES:
+        console.print(f"left out: {len(skipped) - MOST_LINES} more lines", style="red")
+    found = {row.key: mark for row in rows if (mark := marks.altered(row))}
+    sound = [row for row in rows if row.key not in found]
     samples = {row.key: marks.sample(row, options.sample, options.seed) for row in rows}
     try:
-        found = marks.marks_of(
-            rows, samples, engine=engine, open_files=options.open_named_files, console=console
-        )
+        found |= marks.marks_of(
+            sound, samples, engine=engine, open_named_files=options.open_named_files,
+            console=console,
+        )  # fmt: skip
     except KeyboardInterrupt:
         console.print("interrupted: nothing is written; --sample 0 runs no case again")
         raise
@@ -62,10 +69,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
     write_atomically(options.out / "leaderboard.md", text.encode())
     refuted = [row for row in rows if found[row.key].refuted]
     for row in refuted:
-        mark = found[row.key]
-        console.print(
-            f"{row.label} in {row.folder}: {mark.words}: {mark.remark}", markup=False, style="red"
-        )
+        words, remark, _ = found[row.key]
+        line = f"{row.label} in {row.store.folder}: {words}: {remark}"
+        console.print(line, markup=False, style="red")
     console.out(f"leaderboard: {options.out / 'index.html'}, {len(rows)} rows", highlight=False)
     return 1 if refuted else 0
 

@@ -47,17 +47,19 @@ NOTES = (
         "ALE and MLE, the root mean square and the largest lateral error, are interquartile "
         "means over drives (Agarwal et al. 2021), a failed drive counting as infinitely bad: "
         "there is none where more than a quarter failed. Their 95 % intervals are bootstraps "
-        "over drives, stratified by regime or path; of agents with several trainings a second "
-        "one is over trainings. Beside the drives that reached the end of their path stands the "
-        "Clopper-Pearson interval of the rate of failures. Of predict there are the median over "
-        "drives of a drive's median, and the largest 99th percentile of a drive, on the row's "
-        "own machine."
+        "over drives as in lpv-track compare, stratified by path; agents with several trainings "
+        "have a second one over trainings. Beside the drives that reached the end of their path "
+        "stands the Clopper-Pearson interval of the rate of failures. Of predict there are the "
+        "median over drives of a drive's median, and the largest 99th percentile of a drive, on "
+        "the row's own machine."
     ),
     (
         "Rerun here: a sample of the row's cases was run again on the machine that made this "
-        "page. A row of which a case does not reproduce has no place. A sample does not prove "
-        "the rest: the command below each table runs the same sample again, with --id or "
-        "without it any or all."
+        "page. Where versions, sources and processor are those of the row, every bit must be "
+        "the same; elsewhere values must agree to 1e-6. A row of which a case does not "
+        "reproduce, or of which an id does not fit what the case says it drove, has no place. A "
+        "sample proves nothing of the rest: the command below each table runs the same sample "
+        "again, and without --id all."
     ),
 )
 FROM_OTHERS = (
@@ -98,7 +100,7 @@ class Entry:
         """Return the scores of ALE and MLE; None without drives that all trainings have."""
         if not self.row.shared:
             return None
-        ale, mle = (score(self.row.losses(key), self.row.strata) for key in ("ale", "mle"))
+        ale, mle = (score(self.row.losses(key), self.row.plan) for key in ("ale", "mle"))
         return ale, mle
 
 
@@ -183,7 +185,7 @@ def _score(one: Score) -> tuple[str, str]:
 
 
 def _interval(ends: tuple[float, float] | None) -> str:
-    if ends is None:
+    if ends is None or not np.isfinite(ends[0]):
         return ""
     return f"{number(ends[0], 4)} to {number(ends[1], 4)}"
 
@@ -247,7 +249,7 @@ def title_of(section: Section) -> str:
 def command_of(entry: Entry) -> str:
     """Return the command that runs a row's sample again, or without one a sample of its folder."""
     ids = ["--id", *entry.sample] if entry.sample else ["--sample", "5"]
-    return shlex.join(["lpv-track", "reproduce", str(entry.row.folder), *ids])
+    return shlex.join(["lpv-track", "reproduce", str(entry.row.store.folder), *ids])
 
 
 def page(

@@ -1,40 +1,27 @@
-"""Marks of rows: a sample of each row's cases is run again here and compared with what it says."""
+"""Marks of rows: a sample of each row's cases is run again here and compared with what it says.
+
+Besides, the id of every case must fit its fields, as far as this computer can tell.
+"""
 
 import hashlib
+import random
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 from rich.console import Console
 
-import agents
 from experiments.leaderboard.rows import Row
-from experiments.run.benchmark import progress_bar
-from experiments.run.engines import Engine
-from experiments.run.exact import values_of
-from experiments.run.tables import USUAL, Result
-
-Kind = Literal["equal", "close", "differs", "closed"]
-
-NOT_RERUN = "not rerun"
-CLOSED = "own agent file; give --open-named-files"
-
-
-class Rerun(NamedTuple):
-    """A case that was run again: equal bit by bit, within the tolerance, different, or not run.
-
-    `words` says what differs, or why it was not run.
-    """
-
-    id: str
-    kind: Kind
-    words: str = ""
+from experiments.run import reproduction
+from experiments.run.benchmark import CASE_LIMIT, label, progress_bar
+from experiments.run.engines import Engine, Interrupts
+from experiments.run.reproduction import Verdict, origin_words, prepared, reproduce
+from experiments.run.tables import Result
 
 
 class Mark(NamedTuple):
     """What reruns say of a row."""
 
-    words: str = NOT_RERUN
+    words: str = "not rerun"
     remark: str = ""
     refuted: bool = False
     """True if a case does not reproduce: the row is not ranked."""
@@ -44,28 +31,7 @@ def sample(row: Row, number: int, seed: int) -> list[Result]:
     """Draw cases of a row, by its folder and agent, so that other rows do not change the draw."""
     cases = sorted(row.cases, key=lambda case: str(case["id"]))
     digest = hashlib.sha256(f"{seed}\n{row.key}".encode()).digest()
-    random = np.random.default_rng(int.from_bytes(digest[:8]))
-    count = min(number, len(cases))
-    return [cases[k] for k in sorted(random.choice(len(cases), count, replace=False))]
-
-
-def mark_of(reruns: Sequence[Rerun]) -> Mark:
-    """Summarise the reruns of a row's sample."""
-    by_kind: dict[Kind, list[Rerun]] = {}
-    for one in reruns:
-        by_kind.setdefault(one.kind, []).append(one)
-    differs, closed = by_kind.get("differs", []), by_kind.get("closed", [])
-    close, run = by_kind.get("close", []), len(reruns) - len(closed)
-    left = f"{len(closed)} not rerun: {closed[0].words}" if closed else ""
-    if differs:
-        first = f"{differs[0].id}: {differs[0].words}"
-        return Mark(f"✗ does not reproduce ({len(differs)} of {run})", first, refuted=True)
-    if not run:
-        return Mark(f"– {NOT_RERUN}", closed[0].words if closed else "")
-    if close:
-        remark = "; ".join(filter(None, [close[0].words, left]))
-        return Mark(f"✓ within 1e-6 on other versions ({run} of {run})", remark)
-    return Mark(f"✓ bit for bit ({run} of {run})", left)
+    return random.Random(digest).sample(cases, min(number, len(cases)))  # noqa: S311
 
 
 def marks_of(
@@ -73,33 +39,82 @@ def marks_of(
     samples: Mapping[str, Sequence[Result]],
     *,
     engine: Engine,
-    open_files: bool,
+    open_named_files: bool,
     console: Console,
+    limit: float = CASE_LIMIT,
 ) -> dict[str, Mark]:
-    """Run the samples again and return the mark of each row by its key."""
-    reruns: dict[str, list[Rerun]] = {row.key: [] for row in rows if samples[row.key]}
-    wanted: dict[str, list[tuple[str, Result]]] = {}
-    for key, own in reruns.items():
-        for case in samples[key]:
-            if open_files or str(case["agent"]) in agents.names():
-                wanted.setdefault(str(case["id"]), []).append((key, case))
-            else:
-                own.append(Rerun(str(case["id"]), "closed", CLOSED))
-    firsts = [found[0][1] for found in wanted.values()]
-    specs = [{name: case[name] for name in USUAL if name in case} for case in firsts]
-    with progress_bar(console) as progress:
-        bar = progress.add_task("cases again", total=len(specs))
-        for result in engine.run(specs):
-            for key, case in wanted.get(result["id"], []):
-                reruns[key].append(_compared(case, result))
+    """Run the samples again and return the mark of each row by its key.
+
+    Parameters
+    ----------
+    rows
+        The rows.
+    samples
+        Cases of each row, by its key.
+    engine
+        Where the cases run.
+    open_named_files
+        Runs the agents and opens the files that cases name; for results that are trusted.
+    console
+        Receives the progress.
+    limit
+        Time limit of a case, s.
+    """
+    wanted = {
+        row.key: prepared(
+            samples[row.key], row.store.manifest_of, open_named_files=open_named_files
+        )
+        for row in rows
+    }
+    chosen = [one for prepared_rows in wanted.values() for one in prepared_rows.chosen]
+    verdicts: dict[int, Verdict] = {}
+    with progress_bar(console) as progress, Interrupts() as interrupts:
+        bar = progress.add_task("cases", total=len(chosen))
+        for verdict in reproduce(
+            chosen, engine, limit=limit,
+            started=lambda spec: progress.update(bar, description=label(spec)),
+        ):  # fmt: skip
+            interrupts.check()
+            verdicts[id(verdict.row)] = verdict
             progress.advance(bar)
-    return {row.key: mark_of(reruns[row.key]) if row.key in reruns else Mark() for row in rows}
+    return {
+        key: _mark(
+            [verdicts[id(one)] for one in prepared_rows.chosen],
+            [*prepared_rows.not_run.elements(), *prepared_rows.damaged.elements()],
+        )
+        for key, prepared_rows in wanted.items()
+    }
 
 
-def _compared(theirs: Result, ours: Result) -> Rerun:
-    old, new = dict(values_of(theirs)), dict(values_of(ours))
-    for name in {**old, **new}:
-        if old.get(name) != new.get(name):
-            words = f"{name}, theirs {old.get(name)}, ours {new.get(name)}"
-            return Rerun(str(theirs["id"]), "differs", words)
-    return Rerun(str(theirs["id"]), "equal")
+def altered(row: Row) -> Mark | None:
+    """Return the mark of a row with a case whose id does not fit its fields; None without any.
+
+    Only cases of these sources and versions can be checked, and those that name no files.
+    """
+    found = [one for one in prepared(row.cases, row.store.manifest_of).chosen if one.altered]
+    if not found:
+        return None
+    words = f"✗ does not reproduce: {len(found)} of {len(row.cases)} ids do not fit"
+    return Mark(words, f"{found[0].words}: {found[0].altered}", refuted=True)
+
+
+def _mark(verdicts: Sequence[Verdict], not_run: Sequence[str]) -> Mark:
+    """Summarise the reruns of a row's sample."""
+    left = f"{len(not_run)} not rerun: {not_run[0]}" if not_run else ""
+    compared = [one for one in verdicts if not one.note]
+    differ = [one for one in compared if one.differences]
+    if differ:
+        first = f"{differ[0].row.words}: {differ[0].differences[0]}"
+        words = f"✗ does not reproduce ({len(differ)} of {len(compared)})"
+        return Mark(words, first, refuted=True)
+    notes = [one.note for one in verdicts if one.note]
+    if not compared:
+        return (
+            Mark("– not rerun", next(iter([*notes, *not_run]), "")) if notes or not_run else Mark()
+        )
+    count = f"({len(compared)} of {len(verdicts) + len(not_run)})"
+    inexact = [one for one in compared if not one.exact]
+    if inexact:
+        remark = "; ".join(filter(None, [origin_words(inexact[0].row), left, *notes[:1]]))
+        return Mark(f"✓ within {reproduction.RELATIVE:g} {count}", remark)
+    return Mark(f"✓ bit for bit {count}", "; ".join(filter(None, [left, *notes[:1]])))

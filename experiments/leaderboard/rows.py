@@ -6,7 +6,7 @@ count. A folder that was made without a suite is compared with folders of exactl
 """
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from experiments.run import regimes, suites
 from experiments.run.case import Case
+from experiments.run.resampling import Plan, plan_of
 from experiments.run.result_schema import read_driven
 from experiments.run.store import ResultStore
 from experiments.run.tables import (
@@ -44,8 +45,8 @@ class Row:
 
     Parameters
     ----------
-    folder
-        The folder, as it was given.
+    store
+        The folder, named as it was given.
     name
         Short name of the folder, which no other of the board has.
     label
@@ -56,22 +57,25 @@ class Row:
         Number of its results on other drives.
     drives
         Number of the section's drives.
-    manifests
-        Manifests of the runs that its cases come from.
     """
 
-    folder: Path
+    store: ResultStore
     name: str
     label: str
     cases: Sequence[Result]
     further: int
     drives: int
-    manifests: Sequence[Mapping[str, Any]]
 
     @property
     def key(self) -> str:
         """Text that no other row of the board has."""
         return f"{self.name}\n{self.label}"
+
+    @cached_property
+    def manifests(self) -> list[dict[str, Any]]:
+        """Manifests of the runs that its cases come from."""
+        keys = dict.fromkeys(str(case.get("manifest", "before")) for case in self.cases)
+        return [self.store.manifest_of(key) for key in keys]
 
     @cached_property
     def seeds(self) -> list[int]:
@@ -112,13 +116,15 @@ class Row:
         return np.array(of_training, dtype=np.float64).reshape(len(self.by_training), -1)
 
     @property
-    def strata(self) -> list[str]:
-        """Group of each shared drive, within which a bootstrap draws: regime, else path."""
+    def plan(self) -> Plan:
+        """What a bootstrap of the shared drives draws."""
+        if not self.cases:
+            return plan_of([])
         first = next(iter(self.by_training.values()))
-        return [
-            str(first[drive].get("regime") or first[drive].get("trajectory"))
-            for drive in self.shared
-        ]
+        cases = [first[drive] for drive in self.shared]
+        return plan_of(
+            [(setting_of(case), str(case["trajectory"]), case.get("seed", 0)) for case in cases]
+        )
 
     @property
     def trained(self) -> list[dict[str, Any]]:
@@ -172,28 +178,22 @@ def sections_of(folders: Sequence[Path], skipped: list[str]) -> list[Section]:
             raise ValueError(f"{shortened(folder)} is given twice")
     names = _names([str(folder) for folder in folders])
     found: dict[tuple[str, str], Section] = {}
-    for folder in folders:
+    for folder, name in zip(folders, names, strict=True):
         store = ResultStore(folder)
+        before = len(skipped)
         cases = current(store.cases(skipped, read_driven))
         if not cases:
-            skipped.append(f"{folder}: no line of cases.jsonl can be read")
+            skipped.insert(before, f"{folder}: no line of cases.jsonl can be read")
             continue
         suite = _suite(store.manifest())
         drives = drives_of_suite(suite) if suite != CUSTOM else frozenset(map(drive_of, cases))
         section = found.setdefault((suite, _digest(drives)), Section(suite, drives, []))
-        section.rows.extend(_rows(folder, names[str(folder)], store, cases, drives))
+        for label, group in by_label(cases).items():
+            counted = [case for case in group if drive_of(case) in drives]
+            further = len(group) - len(counted)
+            section.rows.append(Row(store, name, label, counted, further, len(drives)))
     known = [*suites.SUITES, CUSTOM]
     return sorted(found.values(), key=lambda section: known.index(section.suite))
-
-
-def _rows(
-    folder: Path, name: str, store: ResultStore, cases: Sequence[Result], drives: frozenset[str]
-) -> Iterable[Row]:
-    for label, group in by_label(cases).items():
-        counted = [case for case in group if drive_of(case) in drives]
-        yield Row(
-            folder, name, label, counted, len(group) - len(counted), len(drives), [store.manifest()]
-        )
 
 
 def _suite(manifest: Mapping[str, Any]) -> str:
@@ -202,11 +202,11 @@ def _suite(manifest: Mapping[str, Any]) -> str:
     return suite if isinstance(suite, str) and suite in suites.SUITES else CUSTOM
 
 
-def _names(folders: Sequence[str]) -> dict[str, str]:
+def _names(folders: Sequence[str]) -> list[str]:
     """Return short names of folders: the last part, the last two, or all, so that they differ."""
     short = path_names(folders)
     found = list(short.values())
-    return {folder: name if found.count(name) == 1 else folder for folder, name in short.items()}
+    return [folder if found.count(short[folder]) > 1 else short[folder] for folder in folders]
 
 
 def _digest(drives: frozenset[str]) -> str:

@@ -63,8 +63,9 @@ def test_rows_of_several_folders_are_ranked_in_one_section(tmp_path: Path) -> No
 def test_a_row_shows_what_its_cases_and_manifest_hold(tmp_path: Path) -> None:
     entry = only(folder(tmp_path / "a", results(0.2)))[0]
     assert texts(entry) == [
-        "stanley | a", "1", "1.00 | 1.00 to 1.00", "2 of 2 | failures 0.0 to 84.2 %", "0.1000",
-        "0.2000", "2.000 | p99 4.00", "2 of 2", "–", "not rerun",
+        "stanley | a", "1", "1.00 | 1.00 to 1.00", "2 of 2 | failures 0.0 to 84.2 %",
+        "0.1000 | 0.1000 to 0.1000", "0.2000 | 0.2000 to 0.2000", "2.000 | p99 4.00",
+        "2 of 2", "–", "not rerun",
     ]  # fmt: skip
     text = markdown([(sections_of([tmp_path / "a"], [])[0], [entry])], "t", "c", [])
     assert "0123456789ab with changes" in text
@@ -98,7 +99,7 @@ def test_drives_beside_those_of_the_suite_do_not_count(tmp_path: Path) -> None:
     entry = only(folder(tmp_path / "a", results(0.2) + further))[0]
     assert entry.place == 1
     assert texts(entry)[7] == "2 of 2 | and 2 further"
-    assert texts(entry)[5] == "0.2000"
+    assert texts(entry)[5] == "0.2000 | 0.2000 to 0.2000"
 
 
 def test_failed_drives_are_behind_and_make_the_scores_infinite(tmp_path: Path) -> None:
@@ -135,7 +136,7 @@ def test_trainings_are_one_row_with_both_spreads(tmp_path: Path) -> None:
     assert [(one.row.label, one.place) for one in entries] == [("pid", 1), ("runs/ppo", 2)]
     shown = texts(entries[1])
     assert shown[3] == "6 of 6 | by training 2 to 2 of 2"
-    assert shown[5].startswith("0.2750 | trainings 0.1")
+    assert shown[5] == "0.2750 | drives 0.2750 to 0.2750; trainings 0.1000 to 0.6000"
     assert shown[7] == "2 of 2"
     assert shown[8] == "3 | together 3.00 k steps, 3 min, 0 solves"
 
