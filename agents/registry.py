@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import inspect
+import os
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -66,6 +67,11 @@ def agent_class(name: str) -> Callable[..., Any]:
     target = REGISTRY.get(name, name)
     module, separator, attribute = target.rpartition(":")
     if not separator:
+        if os.path.isdir(name):  # noqa: PTH112  False for a name that is too long
+            raise ValueError(
+                f"agent {shown(name)} is a folder: give one policy file in it, such as "
+                "seed-0/policy.json; lpv-track benchmark alone takes a folder of trainings"
+            )
         raise ValueError(
             f"unknown agent {shown(name)}; {suggestion(name, REGISTRY)}, "
             "or give your own as file.py:Class or module:Class, a learned policy as its .json"

@@ -24,7 +24,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="paper (default), quick, realtime, learned, plants, limits, recovery, converged, "
         "sideslip or frozen",
     )
-    shared.add_agents(parser, "default: all; your own: file.py:Class, policy.json")
+    shared.add_agents(
+        parser, "default: all; your own: file.py:Class, policy.json, or a folder of trainings"
+    )
     shared.add_trajectories(parser, None, "instead of a suite's: names or files")
     shared.add_vehicles(parser, None, "presets or .json files")
     shared.add_speed_modes(parser, None)
@@ -61,6 +63,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from experiments.run import suites
     from experiments.run.benchmark import CASE_LIMIT, distinct, run_benchmark, selected
     from experiments.run.case import Case
+    from experiments.run.training_folders import expanded, first_training, is_folder
     from trajectories.naming import choose
 
     seeds = shared.seeds_of(options)
@@ -88,10 +91,12 @@ def run(options: argparse.Namespace, console: Console) -> int:
         common["control_period"] = options.control_period
     if options.conditions is not None or options.conditions_set:
         specs = [{**spec, "conditions": shared.conditions_of(options)} for spec in specs]
-    own = shared.agent_settings(options.agent_set, [spec["agent"] for spec in specs])
-    specs = distinct(
-        [merged(spec, {**common, "agent_settings": own[spec["agent"]]}) for spec in specs]
-    )
+    own = shared.agent_settings(
+        options.agent_set, [spec["agent"] for spec in specs],
+        {name: first_training(name)["agent"] for name in names if is_folder(name)},
+    )  # fmt: skip
+    specs = [merged(spec, {**common, "agent_settings": own[spec["agent"]]}) for spec in specs]
+    specs = distinct([one for spec in specs for one in expanded(spec)])
     settings = {
         "suite": suite, "agents": names, "seeds": list(seeds), **common,
         "agent_settings": shared.parse_settings(options.agent_set),

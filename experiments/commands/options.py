@@ -3,7 +3,7 @@
 import argparse
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -313,10 +313,13 @@ def add_agent_settings(parser: argparse.ArgumentParser, nargs: str = "+") -> Non
     )  # fmt: skip
 
 
-def agent_settings(pairs: Sequence[str], agents: Iterable[str]) -> dict[str, dict[str, Any]]:
+def agent_settings(
+    pairs: Sequence[str], agents: Iterable[str], of_folders: Mapping[str, str] | None = None
+) -> dict[str, dict[str, Any]]:
     """Return the settings of each agent from `--agent-set`.
 
     KEY=VALUE sets every agent, NAME:KEY=VALUE the agent NAME alone, whatever the former says.
+    `of_folders` has an agent for each name that is a folder of trainings.
 
     Raises
     ------
@@ -328,7 +331,8 @@ def agent_settings(pairs: Sequence[str], agents: Iterable[str]) -> dict[str, dic
     from agents.registry import check_settings, parameters_of
     from trajectories.naming import choose
 
-    names = tuple(dict.fromkeys(agents))
+    made = {name: (of_folders or {}).get(name, name) for name in agents}
+    names = tuple(made)
     common: dict[str, Any] = {}
     own: dict[str, dict[str, Any]] = {name: {} for name in names}
     for key, value in parse_settings(pairs).items():
@@ -340,8 +344,8 @@ def agent_settings(pairs: Sequence[str], agents: Iterable[str]) -> dict[str, dic
     for key in common:
         defaults = {
             name: known[key].default
-            for name in names
-            if key not in own[name] and key in (known := parameters_of(name) or {})
+            for name, agent in made.items()
+            if key not in own[name] and key in (known := parameters_of(agent) or {})
         }
         named = any(isinstance(default, str | Path) for default in defaults.values())
         if named and len({repr(default) for default in defaults.values()}) > 1:
@@ -351,7 +355,7 @@ def agent_settings(pairs: Sequence[str], agents: Iterable[str]) -> dict[str, dic
             )
     for name in names:
         try:
-            check_settings(name, {**common, **own[name]})
+            check_settings(made[name], {**common, **own[name]})
         except ValueError as error:
             if not common or len(names) == 1:
                 raise

@@ -21,7 +21,17 @@ from experiments.report.svg_charts import BOTTOM, TOP, Chart, Scale, decades
 from experiments.run import tables
 from experiments.run.console_tables import BAND_NOTE, Line, band_lines, band_ranges
 from experiments.run.metrics import BANDS, published_row
-from experiments.run.tables import EFFORT, FURTHER, TRACKING, Column, Estimate, Result, Row, Setting
+from experiments.run.tables import (
+    EFFORT,
+    FURTHER,
+    SPREADS,
+    TRACKING,
+    Column,
+    Estimate,
+    Result,
+    Row,
+    Setting,
+)
 
 ERRORS = (
     ("ale", "ALE (m)", "Average lateral error"),
@@ -43,6 +53,8 @@ def comparison_section(document: Document, cases: Sequence[Result], rows: Sequen
             "t-distribution."
         )
     ]
+    if tables.has_trainings(cases):
+        parts.append(paragraph(tables.TRAININGS_NOTE))
     if any(case.get("training") for case in cases):
         parts.append(paragraph(TRAINED_NOTE))
     parts += _agent_figures(document, cases, rows)
@@ -75,8 +87,8 @@ def _agent_figures(document: Document, cases: Sequence[Result], rows: Sequence[R
             parts.append(
                 document.figure(
                     f"{name} of every agent, {family}. Means, with 95 % intervals where there are "
-                    "several seeds. Dashed: the published values of the same kind; the errata "
-                    "explain how the two differ.",
+                    "several seeds, over trainings where that is wider. Dashed: the published "
+                    "values of the same kind; the errata explain how the two differ.",
                     by_agent(ours, conditions, styles, axis, key),
                     legend(styles, styles),
                 )
@@ -130,14 +142,15 @@ def _shortened(label: str) -> str:
 
 
 def _ends(value: Estimate) -> tuple[float, float]:
-    """Return the ends of an estimate's interval, both the mean if it has none."""
-    width = value.half_width or 0.0
+    """Return the ends of the wider of an estimate's intervals, both the mean if it has none."""
+    width = max(value.half_width or 0.0, value.over_trainings or 0.0)
     return value.mean - width, value.mean + width
 
 
 def _tables(document: Document, setting: Setting, rows: Sequence[Row]) -> str:
     """Return the paper's table, with effort, constraints and further columns folded away."""
     ours = [row for row in rows if not row.published]
+    spreads = f"; {SPREADS}" if any(row.trainings > 1 for row in ours) else ""
     texts: dict[str, Callable[[Row], str]] = {"end": lambda row: row.end}
     if any(row.learning for row in rows):
         texts["trained"] = _trained
@@ -146,12 +159,17 @@ def _tables(document: Document, setting: Setting, rows: Sequence[Row]) -> str:
         "constraints broken: largest excess, share of control periods": lambda row: row.violations,
     }
     tracking = document.table(
-        f"Tracking errors in the paper's terms, {setting}.", html_rows(rows, TRACKING, texts)
+        f"Tracking errors in the paper's terms, {setting}{spreads}.",
+        html_rows(rows, TRACKING, texts),
     )
     known = [column for column in FURTHER if any(column.key in row.values for row in ours)]
     further = [
-        document.table(f"Effort and constraints, {setting}.", html_rows(ours, EFFORT, effort)),
-        document.table(f"Beyond the paper's columns, {setting}.", html_rows(ours, known, {})),
+        document.table(
+            f"Effort and constraints, {setting}{spreads}.", html_rows(ours, EFFORT, effort)
+        ),
+        document.table(
+            f"Beyond the paper's columns, {setting}{spreads}.", html_rows(ours, known, {})
+        ),
     ]
     return joined([tracking, folded("Effort, constraints and further figures", joined(further))])
 
@@ -171,7 +189,7 @@ def html_rows(
     prose = 2 + len(columns)
     lines = []
     for row in rows:
-        label = row.label + (f" ×{row.runs}" if row.runs > 1 else "")
+        label = row.name + (f" ×{row.runs}" if row.runs > 1 else "")
         cells = [column.text(row) for column in columns] + [text(row) for text in texts.values()]
         lines.append(([tables.path_name(row.trajectory), label, *cells], row.published))
     return html_groups(headings, lines, range(2, prose), range(prose, len(headings)))
@@ -192,16 +210,18 @@ def curvature_section(document: Document, cases: Sequence[Result], styles: Style
     if own:
         figure = document.figure(
             "ALE by the path's curvature. Mean with its 95 % interval over seeds where there are "
-            "several; hollow marks are those whose lines are dashed elsewhere.",
+            "several, over trainings where that is wider; hollow marks are those whose lines are "
+            "dashed elsewhere.",
             by_band({str(setting): found for setting, found in own.items()}, styles),
             legend(styles, [label for found in own.values() for label, _ in found]),
             wide=True,
         )
 
-    def table(setting: Setting, _: Sequence[Result]) -> str:
+    def table(setting: Setting, group: Sequence[Result]) -> str:
         if setting not in lines:
             return ""
-        caption = f"ALE (m) by the path's curvature, {setting}."
+        spreads = f"; {SPREADS}" if tables.has_trainings(group) else ""
+        caption = f"ALE (m) by the path's curvature, {setting}{spreads}."
         return document.table(caption, _band_table(lines[setting]))
 
     return joined([paragraph(BAND_NOTE), figure, per_setting(cases, table)])

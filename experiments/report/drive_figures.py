@@ -283,9 +283,11 @@ def _not_drawn(drives: Sequence[Drive], missing: Sequence[Result]) -> str:
     parts = []
     if any(drive.case.get("seed") for drive in drives):
         parts.append(paragraph("Of several seeds only the first is drawn."))
+    if any(tables.training_of(drive.case) is not None for drive in drives):
+        parts.append(paragraph("Of several trainings only the first is drawn."))
     if missing:
         names = ", ".join(
-            f"{tables.label_of(case)} on {case.get('trajectory')} (seed {case.get('seed')})"
+            f"{tables.case_name(case)} on {case.get('trajectory')} (seed {case.get('seed')})"
             for case in missing
         )
         parts.append(paragraph(f"Not drawn, because their traces cannot be read: {names}.", "bad"))

@@ -141,7 +141,7 @@ def _reached(cases: Iterable[Result], drives: Mapping[Any, Drive]) -> str:
         drive = drives.get(case["id"])
         lines.append(
             [
-                tables.label_of(case),
+                tables.case_name(case),
                 str(case.get("trajectory")),
                 str(tables.setting_of(case)),
                 str(case.get("seed")),

@@ -33,8 +33,9 @@ END_HEADINGS = (
 END_NOTE = (
     "A drive fails if it does not reach the end of the path. Intervals are two-sided "
     "Clopper-Pearson intervals of the rate of failures. Drives of one seed share their "
-    "disturbances and so are not quite independent. Deadline misses are computations that ended "
-    "too late in the simulated vehicle; a vehicle brakes by itself when no command arrives in time."
+    "disturbances and so are not quite independent; of several trainings of an agent the range of "
+    "their rates stands beside the interval of all drives. Deadline misses are computations that "
+    "ended too late in the simulated vehicle; a vehicle brakes by itself when none arrives in time."
 )
 
 Tile = tuple[str, str, str]
@@ -55,16 +56,23 @@ def summary_section(document: Document, cases: Sequence[Result], superseded: int
             )
         )
     parts.append(paragraph(KEY_NOTE, "soft"))
+    if tables.has_trainings(cases):
+        parts.append(paragraph(tables.TRAININGS_NOTE, "soft"))
     parts.append(
         per_setting(
             cases,
             lambda setting, group: document.table(
-                f"Key figures of every agent, {setting}.",
+                f"Key figures of every agent, {setting}{_spreads(group)}.",
                 html_table(KEY_FIGURES, key_lines(group), range(1, len(KEY_FIGURES))),
             ),
         )
     )
     return joined(parts)
+
+
+def _spreads(cases: Sequence[Result]) -> str:
+    """Return the words of a caption on the intervals of agents with several trainings."""
+    return f"; {tables.SPREADS}" if tables.has_trainings(cases) else ""
 
 
 def regime_section(document: Document, cases: Sequence[Result]) -> str:
@@ -221,7 +229,7 @@ def failures_section(document: Document, cases: Sequence[Result]) -> str:
     )
     failed = [
         [
-            str(case["id"]), tables.label_of(case), str(case.get("trajectory")),
+            str(case["id"]), tables.case_name(case), str(case.get("trajectory")),
             str(tables.setting_of(case)), str(case.get("seed")),
             str(case.get("error", "no message")),
         ]
@@ -251,11 +259,14 @@ def _end_line(label: str, cases: Sequence[Result]) -> list[str]:
     low, high = rate_interval(len(cases) - whole, len(cases))
     solves = sum(case["solver"].get("solves") or 0 for case in done)
     failures = sum(case["solver"].get("failures") or 0 for case in done)
+    by_training = tables.training_range(cases, lambda case: case.get("end") != "finished")
     misses = sum(case["metrics"].get("deadline_misses", 0.0) for case in done)
     braked = sum(case["metrics"].get("stopping_share", 0.0) > 0.0 for case in done)
     return [
-        label, str(len(cases)), str(whole), str(left), str(len(done) - whole - left),
+        tables.with_trainings(label, tables.trainings_of(cases)), str(len(cases)), str(whole),
+        str(left), str(len(done) - whole - left),
         str(len(cases) - len(done)), f"{100 * (1 - whole / len(cases)):.1f}",
-        f"{100 * low:.1f} to {100 * high:.1f}", f"{failures} of {solves}" if solves else "–",
+        ", ".join(filter(None, [f"{100 * low:.1f} to {100 * high:.1f}", by_training])),
+        f"{failures} of {solves}" if solves else "–",
         f"{misses:.0f}", f"{braked}",
     ]  # fmt: skip

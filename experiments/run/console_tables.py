@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from rich import box
@@ -17,7 +16,9 @@ from experiments.run.metrics import BANDS, PAPER_SIMULATION, published_row
 from experiments.run.tables import (
     EFFORT,
     PUBLISHED_NOTE,
+    SPREADS,
     TRACKING,
+    TRAININGS_NOTE,
     Estimate,
     Result,
     Row,
@@ -26,12 +27,16 @@ from experiments.run.tables import (
     by_setting,
     cases_by_setting,
     current,
-    estimate,
+    has_trainings,
     ordered,
     path_name,
     path_names,
+    training_of,
     trainings,
+    trainings_of,
+    two_way,
     violated,
+    with_trainings,
 )
 
 KEY_FIGURES = (
@@ -59,19 +64,17 @@ SCREEN = 8
 def over_seeds(cases: Iterable[Result], key: str) -> Estimate:
     """Compute the mean over seeds of a metric's mean over a seed's drives, with its interval.
 
-    Drives of one seed share their disturbances whatever the path.
+    Drives of one seed share their disturbances whatever the path. An agent with several trainings
+    has a second interval, over the means of each.
     """
-    by_seed: dict[Any, list[float]] = {}
-    for case in cases:
-        by_seed.setdefault(case.get("seed"), []).append(float(case["metrics"][key]))
-    return estimate([sum(values) / len(values) for values in by_seed.values()])
+    return two_way(
+        (case.get("seed"), training_of(case), float(case["metrics"][key])) for case in cases
+    )
 
 
 def with_interval(value: Estimate, decimals: int = 3) -> str:
-    """Write a mean and, where there is one, the half width of its interval."""
-    mean = f"{value.mean:.{decimals}f}"
-    width = value.half_width
-    return mean if width is None else f"{mean} ±{width:.{decimals}f}"
+    """Write a mean and, where there are some, the half widths of its intervals."""
+    return value.words(decimals)
 
 
 def against_published(cases: Iterable[Result]) -> str:
@@ -92,7 +95,7 @@ def key_lines(cases: Sequence[Result]) -> list[list[str]]:
     for label, group in by_label(cases).items():
         done = [case for case in group if case.get("status") == "ok"]
         finished = sum(case.get("end") == "finished" for case in group)
-        line = [label, f"{finished} of {len(group)}"]
+        line = [with_trainings(label, trainings_of(group)), f"{finished} of {len(group)}"]
         if not done:
             lines.append([*line, *["–"] * (len(KEY_FIGURES) - len(line))])
             continue
@@ -147,7 +150,8 @@ def band_lines(cases: Sequence[Result]) -> list[Line]:
         measured = [
             case for case in group if any(f"ale_{name}" in case["metrics"] for name in BANDS.names)
         ]
-        lines.append((label, [_cell(measured, name) for name in BANDS.names]))
+        cells = [_cell(measured, name) for name in BANDS.names]
+        lines.append((label, cells))
     return lines if any(cell for _, cells in lines for cell in cells) else []
 
 
@@ -182,7 +186,8 @@ def all_tables(cases: Iterable[Result]) -> RenderableType:
     groups = cases_by_setting(kept)
     parts: list[RenderableType] = [*by_regime(kept)]
     for setting, rows in by_setting(build_rows(kept)).items():
-        parts += [_tracking(str(setting), rows), _effort(rows)]
+        title = _with_spreads(str(setting), any(row.trainings > 1 for row in rows))
+        parts += [_tracking(title, rows), _effort(rows)]
         if (curvature := _curvature(groups[setting])) is not None:
             parts.append(curvature)
         parts.append(Text())
@@ -190,7 +195,7 @@ def all_tables(cases: Iterable[Result]) -> RenderableType:
         Text(f"trained: {label}: {training.get('algorithm', '?')}, {words(training)}")
         for label, training in trainings(kept)
     ]
-    return Group(*parts, *learning, Text(PUBLISHED_NOTE, style="dim"))
+    return Group(*parts, *learning, *_spread_note(kept), Text(PUBLISHED_NOTE, style="dim"))
 
 
 def by_regime(cases: Sequence[Result]) -> list[RenderableType]:
@@ -207,6 +212,16 @@ def by_regime(cases: Sequence[Result]) -> list[RenderableType]:
     return [ranked, notes[0], Text(), Text("By regime", style="bold"), *found, notes[1]]
 
 
+def _spread_note(cases: Sequence[Result]) -> list[RenderableType]:
+    """Return the note on agents with several trainings; none without any."""
+    return [Text(TRAININGS_NOTE, style="dim")] if has_trainings(cases) else []
+
+
+def _with_spreads(title: str, several: bool) -> str:
+    """Return a title that says which ± is which, where an agent has several trainings."""
+    return f"{title} · {SPREADS}" if several else title
+
+
 def screen(cases: Iterable[Result]) -> tuple[RenderableType, bool]:
     """Return tables that fit on a screen, and whether they are all there are.
 
@@ -216,14 +231,15 @@ def screen(cases: Iterable[Result]) -> tuple[RenderableType, bool]:
     """
     kept = ordered(current(cases))
     if found := by_regime(kept):
-        return Group(*found), False
+        return Group(*found, *_spread_note(kept)), False
     rows = [row for row in build_rows(kept) if not row.published]
     if len(rows) <= SCREEN:
         return all_tables(kept), True
     groups = cases_by_setting(kept)
     family = next(iter(groups)).family
     shown = [setting for setting in groups if setting.family == family][:2]
-    return Group(*(_key_figures(str(setting), groups[setting]) for setting in shown)), False
+    figures = [_key_figures(str(setting), groups[setting]) for setting in shown]
+    return Group(*figures, *_spread_note(kept)), False
 
 
 def _start(title: str | None = None) -> Table:
@@ -238,12 +254,12 @@ def _add_agent_column(table: Table) -> None:
 
 
 def _key_figures(title: str, cases: Sequence[Result]) -> Table:
-    table = _start(title)
+    table = _start(_with_spreads(title, has_trainings(cases)))
     _add_agent_column(table)
     for heading in KEY_HEADINGS[1:]:
         table.add_column(heading, justify="right", no_wrap=True)
     for line in key_lines(cases):
-        table.add_row(*map(Text, line))
+        table.add_row(*(Text(cell.replace(" ±", "\n±")) for cell in line))
     return table
 
 
@@ -252,7 +268,8 @@ def _curvature(cases: Sequence[Result]) -> Table | None:
     lines = band_lines(cases)
     if not lines:
         return None
-    table = _start("ALE by curvature, m; drives, share of time")
+    title = "ALE by curvature, m; drives, share of time"
+    table = _start(_with_spreads(title, has_trainings(cases)))
     table.title_style = ""
     _add_agent_column(table)
     for name, bounds in zip(BANDS.names, band_ranges(), strict=True):
@@ -310,7 +327,7 @@ def _add_lines(table: Table, rows: Sequence[Row], cells: Callable[[Row], Sequenc
         seen = row.trajectory
         table.add_row(
             Text(name, style="bold"),
-            *(Text(cell) for cell in (row.label, *cells(row))),
+            *(Text(cell) for cell in (row.name, *cells(row))),
             style="italic dim" if row.published else "",
             end_section=last,
         )

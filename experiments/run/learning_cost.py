@@ -1,6 +1,6 @@
 """Cost of making a learned policy, which results and tables show beside what it achieves."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from agents import Agent
@@ -13,14 +13,15 @@ KINDS: Mapping[str, tuple[type, ...]] = {
     "command": (str,),
 }
 """Entries kept of a policy's `training`: environment steps, wall time (s), NMPC solves, command."""
+AVERAGED = ("steps", "seconds", "solves")
 UNKNOWN = "not recorded"
 
 
 def of_agent(agent: Agent) -> dict[str, Any]:
     """Return `{"training": {...}}` for an agent that runs a learned policy, {} for every other.
 
-    The entry holds `algorithm` and those of `KINDS` that the policy's `training` has. Agents
-    without a policy were designed by hand, at a cost that nobody recorded.
+    The entry holds `algorithm`, those of `KINDS` that the policy's `training` has, and its `seed`.
+    Agents without a policy were designed by hand, at a cost that nobody recorded.
     """
     policy = getattr(agent, "policy", None)  # delay compensation forwards it
     if not isinstance(policy, Policy):
@@ -30,7 +31,20 @@ def of_agent(agent: Agent) -> dict[str, Any]:
         for key, kinds in KINDS.items()
         if type(policy.training.get(key)) in kinds
     }
+    settings = policy.training.get("settings")
+    if isinstance(settings, Mapping) and type(settings.get("seed")) is int:
+        known["seed"] = settings["seed"]
     return {"training": {"algorithm": policy.algorithm, **known}}
+
+
+def average(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the mean cost of trainings, of each quantity over those that recorded it."""
+    found = {}
+    for key in AVERAGED:
+        known = [training[key] for training in trainings if key in training]
+        if known:
+            found[key] = round(sum(known) / len(known))
+    return found
 
 
 def words(training: Mapping[str, Any]) -> str:

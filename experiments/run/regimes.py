@@ -15,7 +15,17 @@ from agents.weight_tuning.score import SCALES
 from experiments.run import physical_limits
 from experiments.run.search import passes
 from experiments.run.statistics import rate_interval
-from experiments.run.tables import Result, by_label, ordered
+from experiments.run.tables import (
+    Estimate,
+    Result,
+    by_label,
+    ordered,
+    training_of,
+    training_range,
+    trainings_of,
+    two_way,
+    with_trainings,
+)
 
 
 class Mean(NamedTuple):
@@ -63,7 +73,10 @@ NOTE = (
     "Overshoot is the largest lateral error on the other side of the path than the start; a "
     "vehicle is back once its lateral error stays below 0.1 m. Entry speeds are the highest with "
     "which a lane change is passed without touching a cone, and fastest laps those over all shares "
-    "of grip tried, each beside its share of what an optimal control problem says is possible."
+    "of grip tried, each beside its share of what an optimal control problem says is possible. "
+    "Of an agent with several trainings the drives of all are counted; beside the interval of its "
+    "rate of failures stands the range of its trainings' rates, and ± is the 95 % interval of a "
+    "mean over trainings, by the t-distribution."
 )
 SCORED = ("ale", "aoe", "rms_speed_error", "steering_rate_rms", "jerk_rms")
 """Metrics whose sum, each divided by its scale, is the score (`agents.weight_tuning.score`)."""
@@ -77,17 +90,28 @@ class Line(NamedTuple):
     failed: int
     means: tuple[float | None, ...]
     columns: tuple[Mean, ...] = MEANS
+    trainings: int = 0
+    by_training: str = ""
+    """Range of the trainings' rates of failures, if there are several."""
+    spreads: tuple[float | None, ...] = ()
+    """Half widths of the means' 95 % intervals over trainings, for each column."""
 
     @property
     def cells(self) -> list[str]:
         """Text of the columns of `headings`."""
-        numbers = (
-            "–" if mean is None else f"{column.factor * mean:.{column.decimals}f}"
-            for mean, column in zip(self.means, self.columns, strict=True)
-        )
+        spreads = self.spreads or (None,) * len(self.means)
+        numbers = [
+            "–"
+            if mean is None
+            else Estimate(mean, spread).words(column.decimals, factor=column.factor)
+            for mean, spread, column in zip(self.means, spreads, self.columns, strict=True)
+        ]
         low, high = (100.0 * end for end in rate_interval(self.failed, self.drives))
         interval = f"{low:.0f}–{high:.0f} %"
-        return [self.label, f"{self.drives}", f"{self.failed}", interval, *numbers]
+        if self.by_training:
+            interval += f", {self.by_training}"
+        name = with_trainings(self.label, self.trainings)
+        return [name, f"{self.drives}", f"{self.failed}", interval, *numbers]
 
 
 def by_regime(cases: Iterable[Result]) -> dict[str, list[Result]]:
@@ -123,8 +147,19 @@ def lines(cases: Iterable[Result]) -> list[Line]:
 
 def _line(label: str, cases: Sequence[Result], columns: tuple[Mean, ...]) -> Line:
     finished = [case for case in cases if passed(case)]
-    means = tuple(_mean([figure(case, column) for case in finished]) for column in columns)
-    return Line(label, len(cases), len(cases) - len(finished), means, columns)
+    found = [[(training_of(case), figure(case, column)) for case in finished] for column in columns]
+    means = tuple(_mean([value for _, value in values]) for values in found)
+    failed = len(cases) - len(finished)
+    if (count := trainings_of(cases)) < 2:
+        return Line(label, len(cases), failed, means, columns, count)
+    spreads = tuple(
+        two_way((None, training, value) for training, value in values if value is not None)
+        .over_trainings
+        if mean is not None else None
+        for mean, values in zip(means, found, strict=True)
+    )  # fmt: skip
+    by_training = training_range(cases, lambda case: not passed(case))
+    return Line(label, len(cases), failed, means, columns, count, by_training, spreads)
 
 
 def passed(case: Result) -> bool:
@@ -184,7 +219,8 @@ def tables_of(cases: Iterable[Result]) -> list[Table]:
             shown.append(_start(columns))
         for place, line in enumerate(found):
             first = Text("" if place else name, style="bold")
-            shown[-1].add_row(first, *map(Text, line.cells), end_section=place + 1 == len(found))
+            cells = (Text(cell.replace(" ±", "\n±").replace(", ", "\n", 1)) for cell in line.cells)
+            shown[-1].add_row(first, *cells, end_section=place + 1 == len(found))
     return shown
 
 

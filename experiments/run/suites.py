@@ -2,9 +2,11 @@
 
 import math
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import agents
+from experiments.run.training_folders import first_training
 from lpv_track_env import plants
 from trajectories import PUBLISHED
 
@@ -176,7 +178,7 @@ def grid(
     In the speed mode "grip" each of `grips` is driven.
     """
     shares = [{"grip": grip} for grip in grips] or [{}]
-    named = sorted(agent_names, key=lambda name: not name.startswith("lpv-nmpc"))
+    named = sorted(agent_names, key=lambda name: not _is_nmpc(name))
     return [
         {
             "agent": agent,
@@ -257,7 +259,7 @@ def converged(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
 
 def sideslip(agent_names: Sequence[str], seeds: Sequence[int]) -> list[Spec]:
     """`course-car` with the limit |vy| <= 0.17 vx and with a wider one (errata, 5)."""
-    solved = [name for name in agent_names if name.startswith("lpv-nmpc")]
+    solved = [name for name in agent_names if _is_nmpc(name)]
     car, wide = ("course-car",), {"max_lateral_velocity_ratio": 0.5}
     return [
         *grid(solved, SIX, vehicles=car, seeds=seeds),
@@ -325,13 +327,29 @@ def _far_seeing(agent_names: Iterable[str]) -> list[str]:
 
 
 def _near_sighted(name: str) -> bool:
-    """Return whether an agent is a policy file trained for another preview than `RAW_PREVIEW`."""
-    if not name.endswith(".json"):
-        return False
-    from agents.learned.policy import read
+    """Return whether an agent is a policy trained for another preview than `RAW_PREVIEW`.
 
-    layout = read(name).layout
-    return {key: getattr(layout, key) for key in RAW_PREVIEW} != RAW_PREVIEW
+    A policy is a file, or those of a folder of trainings.
+    """
+    one = first_training(name)
+    if weights := one.get("agent_settings", {}).get("weights"):
+        from agents.weight_tuning.policy import load
+
+        policy: Any = load(Path(weights))
+    elif one["agent"].endswith(".json"):
+        from agents.learned.policy import read
+
+        policy = read(one["agent"])
+    else:
+        return False
+    # A schedule of weights has no preview.
+    layout = getattr(policy, "layout", None)
+    return layout is not None and {key: getattr(layout, key) for key in RAW_PREVIEW} != RAW_PREVIEW
+
+
+def _is_nmpc(name: str) -> bool:
+    """Return whether an agent is an NMPC of the family `lpv-nmpc`, or a folder of its tunings."""
+    return str(first_training(name)["agent"]).startswith("lpv-nmpc")
 
 
 def _by_speed(agent_names: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -7,25 +7,26 @@ mean and its 95 % interval by the t-distribution.
 
 import hashlib
 import json
-import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import t as student
 
 import agents
 import trajectories
 from experiments.run import suites
 from experiments.run.case import Case
-from experiments.run.learning_cost import words
+from experiments.run.learning_cost import average, words
 from experiments.run.metrics import KEPT, PAPER_COLUMNS, published_row
 from experiments.run.statistics import CONFIDENCE
+from experiments.run.training_folders import trained
 
 Result = Mapping[str, Any]
 
@@ -45,6 +46,14 @@ SYMBOLS = {
     "steering_rate": "|dδ/dt|",
     "jerk": "|da/dt|",
 }
+SPREADS = "± over evaluation seeds ± over trainings"
+"""Heading of tables in which an agent has several trainings."""
+TRAININGS_NOTE = (
+    "An agent with several trainings is one row: its mean over trainings and evaluation seeds, ± "
+    "the 95 % interval over evaluation seeds (of each seed's mean over trainings), ± the one over "
+    "trainings (of each training's mean over seeds), both by the t-distribution. The two are never "
+    "pooled; where there is one evaluation seed, the first is missing (±–)."
+)
 PUBLISHED_LABEL = "published"
 PUBLISHED_DECIMALS = 2
 PUBLISHED_NOTE = (
@@ -52,13 +61,6 @@ PUBLISHED_NOTE = (
     "with the vehicle. They are for orientation only, since its vehicle, weights and paths are not "
     "public."
 )
-TUNED = "lpv-nmpc-tuned"
-"""Agent that drives with the weights of a tuning."""
-TRAINED = re.compile(
-    r"(?:(?P<folder>.+)[/\\])?seed-(?P<seed>0|[1-9]\d{0,2})[/\\](?:policy|weights)\.json",
-    re.DOTALL,
-)
-"""File of one of several trainings, which `--seeds` puts into folders beside each other."""
 LONGEST, CUT = 80, 48
 """Most characters of a setting's value in a label, and those that are kept of a longer one."""
 
@@ -175,10 +177,26 @@ def conditions_words(given: str | Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean over runs, and the half width of its 95 % interval if there are several."""
+    """Mean over runs, and half widths of its 95 % intervals.
+
+    `half_width` is that over evaluation seeds, `over_trainings` that over the trainings of an
+    agent; each is None where there are not several.
+    """
 
     mean: float
     half_width: float | None = None
+    over_trainings: float | None = None
+
+    def words(self, decimals: int, separator: str = " ", factor: float = 1.0) -> str:
+        """Write `factor` times the mean and half widths, ± each after `separator`.
+
+        The second ± is that over trainings; where there is one evaluation seed the first is "±–".
+        """
+        widths = [self.half_width, self.over_trainings]
+        while widths and widths[-1] is None:
+            widths.pop()
+        ends = ["–" if width is None else f"{factor * width:.{decimals}f}" for width in widths]
+        return separator.join([f"{factor * self.mean:.{decimals}f}", *(f"±{end}" for end in ends)])
 
 
 @dataclass(frozen=True)
@@ -193,15 +211,12 @@ class Column:
     source: str = "metrics"
 
     def text(self, row: "Row", separator: str = " ") -> str:
-        """Return the cell of a row: the mean, and ± half width after `separator`."""
+        """Return the cell of a row, see `Estimate.words`."""
         found = row.values.get(self.key)
         if found is None:
             return "–"
         decimals = PUBLISHED_DECIMALS if row.published else self.decimals
-        mean = f"{self.factor * found.mean:.{decimals}f}"
-        if found.half_width is None:
-            return mean
-        return f"{mean}{separator}±{self.factor * found.half_width:.{decimals}f}"
+        return found.words(decimals, separator, self.factor)
 
 
 TRACKING = tuple(Column(key, heading, unit, 3) for key, (heading, unit) in PAPER_COLUMNS.items())
@@ -245,6 +260,12 @@ class Row:
     violations: str = ""
     learning: str = ""
     runs: int = 0
+    trainings: int = 0
+
+    @property
+    def name(self) -> str:
+        """Label, and the number of trainings if there are several."""
+        return with_trainings(self.label, self.trainings)
 
 
 def estimate(values: Sequence[float]) -> Estimate:
@@ -255,6 +276,24 @@ def estimate(values: Sequence[float]) -> Estimate:
         return Estimate(mean)
     quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, n - 1))
     return Estimate(mean, quantile * float(np.std(values, ddof=1)) / n**0.5)
+
+
+def two_way(values: Iterable[tuple[Hashable, int | None, float]]) -> Estimate:
+    """Return the mean of values that belong to a drive and a training, with both intervals.
+
+    Values of one drive, such as an evaluation seed, are averaged, and the mean of these means has
+    its interval over drives; values of one training are averaged likewise, if there are several.
+    """
+    drives: dict[Hashable, list[float]] = {}
+    by_training: dict[int | None, list[float]] = {}
+    for drive, training, value in values:
+        drives.setdefault(drive, []).append(value)
+        by_training.setdefault(training, []).append(value)
+    found = estimate([float(np.mean(group)) for group in drives.values()])
+    if len(by_training) < 2:
+        return found
+    spread = estimate([float(np.mean(group)) for group in by_training.values()])
+    return replace(found, over_trainings=spread.half_width)
 
 
 def path_name(trajectory: object) -> str:
@@ -274,33 +313,58 @@ def path_names(trajectories: Iterable[str]) -> dict[str, str]:
 
 def training_of(case: Result) -> int | None:
     """Return the training seed of a case's agent, one of several in a folder; None for others."""
-    return _trained(case)[1]
+    return trained(case).seed
 
 
 def label_of(case: Result) -> str:
     """Return a case's agent, with its settings if any; this names its rows.
 
-    The policies in `FOLDER/seed-N/policy.json` are one agent called FOLDER, and so is
-    `lpv-nmpc-tuned` with the weights in `FOLDER/seed-N/weights.json`; `training_of` gives N.
+    The trainings of a folder are one agent, see `training_folders.trained`.
     """
-    return _trained(case)[0]
+    agent, settings, _ = trained(case)
+    return f"{agent} ({_changes(settings)})" if settings else agent
 
 
-def _trained(case: Result) -> tuple[str, int | None]:
-    """Return the label of a case's agent and its training seed."""
-    agent, settings = str(case.get("agent", "?")), case.get("agent_settings") or {}
-    found = TRAINED.fullmatch(agent)
-    if found is None and (found := TRAINED.fullmatch(str(settings.get("weights")))):
-        folder = found["folder"] or "."
-        settings = {key: value for key, value in settings.items() if key != "weights"}
-        if agent == TUNED:
-            agent = folder
-        else:
-            settings["weights"] = folder
-    elif found is not None:
-        agent = found["folder"] or "."
-    label = f"{agent} ({_changes(settings)})" if settings else agent
-    return label, int(found["seed"]) if found is not None else None
+def trainings_of(cases: Iterable[Result]) -> int:
+    """Return the number of training seeds among the cases of an agent."""
+    return len({training_of(case) for case in cases} - {None})
+
+
+def with_trainings(label: str, count: int) -> str:
+    """Return an agent's label, and the number of its trainings if there are several."""
+    return f"{label}, {count} trainings" if count > 1 else label
+
+
+def case_name(case: Result) -> str:
+    """Return the label of a case's agent, and its training seed if it has one."""
+    training = training_of(case)
+    return label_of(case) if training is None else f"{label_of(case)}, training {training}"
+
+
+def has_trainings(cases: Iterable[Result]) -> bool:
+    """Return whether an agent of the cases has several trainings."""
+    found: dict[str, int] = {}
+    for case in cases:
+        if (training := training_of(case)) is not None and (
+            found.setdefault(label_of(case), training) != training
+        ):
+            return True
+    return False
+
+
+def training_range(cases: Iterable[Result], failed: Callable[[Result], bool]) -> str:
+    """Return the least and largest rate of failures among trainings; "" without several."""
+    groups: dict[int | None, list[bool]] = {}
+    for case in cases:
+        groups.setdefault(training_of(case), []).append(failed(case))
+    if len(groups) < 2:
+        return ""
+    return range_words([100.0 * sum(group) / len(group) for group in groups.values()])
+
+
+def range_words(rates: Sequence[float] | NDArray[np.float64]) -> str:
+    """Write the least and the largest of the trainings' rates, %."""
+    return f"{min(rates):.0f}–{max(rates):.0f} % by training"
 
 
 def labels(cases: Iterable[Result]) -> list[str]:
@@ -362,6 +426,7 @@ def ordered(cases: Iterable[Result]) -> list[Result]:
             agent(str(case.get("agent"))),
             label_of(case),
             case.get("seed", 0),
+            -1 if (training := training_of(case)) is None else training,
         ),
     )
 
@@ -410,23 +475,28 @@ def _end_words(cases: Sequence[Result]) -> str:
 
 
 def trainings(cases: Iterable[Result]) -> list[tuple[str, dict[str, Any]]]:
-    """Return label and training of every learned policy, each distinct one once."""
+    """Return name and training of every learned policy, each distinct one once."""
     found: list[tuple[str, dict[str, Any]]] = []
-    for label, group in by_label(cases).items():
-        for case in group:
-            if (training := case.get("training")) and (label, training) not in found:
-                found.append((label, dict(training)))
+    for group in by_label(cases).values():
+        for case in sorted(group, key=lambda case: training_of(case) or 0):
+            if (training := case.get("training")) and (case_name(case), training) not in found:
+                found.append((case_name(case), dict(training)))
     return found
 
 
 def _agent_row(setting: Setting, trajectory: str, label: str, cases: Sequence[Result]) -> Row:
     done = [case for case in cases if case.get("status") == "ok"]
     values = {}
+    drives = [(_drive(case), training_of(case)) for case in done]
     for column in (*TRACKING, *EFFORT, *FURTHER):
         found = [case.get(column.source, {}).get(column.key) for case in done]
-        numbers = [float(value) for value in found if value is not None]
+        numbers = [
+            (*drive, float(value))
+            for drive, value in zip(drives, found, strict=True)
+            if value is not None
+        ]
         if numbers:
-            values[column.key] = estimate(numbers)
+            values[column.key] = two_way(numbers)
     return Row(
         setting=setting,
         trajectory=trajectory,
@@ -435,9 +505,23 @@ def _agent_row(setting: Setting, trajectory: str, label: str, cases: Sequence[Re
         end=_end_words(cases),
         failures=_failure_words(done) if done else "–",
         violations=_violation_words([case["metrics"] for case in done]) if done else "–",
-        learning="; ".join(dict.fromkeys(words(training) for _, training in trainings(cases))),
+        learning=_learning_words(cases),
         runs=len(done),
+        trainings=trainings_of(cases),
     )
+
+
+def _learning_words(cases: Sequence[Result]) -> str:
+    """Return what the learning of an agent cost, the mean of a training if there are several."""
+    found = [training for _, training in trainings(cases)]
+    if found and trainings_of(cases) > 1:
+        return f"each {words(average(found))}"
+    return "; ".join(dict.fromkeys(map(words, found)))
+
+
+def _drive(case: Result) -> tuple[Any, ...]:
+    """Return what distinguishes the drives of an agent within a row, except its training."""
+    return case.get("seed"), repr(case.get("start")), repr(case.get("search"))
 
 
 def build_rows(cases: Iterable[Result]) -> list[Row]:
