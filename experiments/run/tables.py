@@ -487,7 +487,12 @@ def trainings(cases: Iterable[Result]) -> list[tuple[str, dict[str, Any]]]:
 def _agent_row(setting: Setting, trajectory: str, label: str, cases: Sequence[Result]) -> Row:
     done = [case for case in cases if case.get("status") == "ok"]
     values = {}
-    drives = [(_drive(case), training_of(case)) for case in done]
+    count = trainings_of(cases)
+    # Each case is a drive of its own unless several trainings share them.
+    drives = [
+        (drive_of(case) if count > 1 else place, training_of(case))
+        for place, case in enumerate(done)
+    ]
     for column in (*TRACKING, *EFFORT, *FURTHER):
         found = [case.get(column.source, {}).get(column.key) for case in done]
         numbers = [
@@ -507,7 +512,7 @@ def _agent_row(setting: Setting, trajectory: str, label: str, cases: Sequence[Re
         violations=_violation_words([case["metrics"] for case in done]) if done else "–",
         learning=_learning_words(cases),
         runs=len(done),
-        trainings=trainings_of(cases),
+        trainings=count,
     )
 
 
@@ -517,11 +522,6 @@ def _learning_words(cases: Sequence[Result]) -> str:
     if found and trainings_of(cases) > 1:
         return f"each {words(average(found))}"
     return "; ".join(dict.fromkeys(map(words, found)))
-
-
-def _drive(case: Result) -> tuple[Any, ...]:
-    """Return what distinguishes the drives of an agent within a row, except its training."""
-    return case.get("seed"), repr(case.get("start")), repr(case.get("search"))
 
 
 def build_rows(cases: Iterable[Result]) -> list[Row]:
