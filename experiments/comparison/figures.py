@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, NullLocator
 
 from experiments.comparison.outcomes import Metric, Outcome
 from experiments.figures import COLOURS, STYLE, plain_ticks, save_figure
@@ -27,6 +28,7 @@ PRINT: dict[str, Any] = {
     "axes.titlesize": 7.0,
     "legend.fontsize": 7.0,
     "lines.linewidth": 1.0,
+    "lines.solid_capstyle": "butt",
     # Fonts are embedded in PDF as TrueType, and drawn as outlines in SVG.
     "pdf.fonttype": 42,
     "svg.fonttype": "path",
@@ -35,6 +37,8 @@ PRINT: dict[str, Any] = {
 SUFFIXES = (".svg", ".pdf")
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)))
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
+NARROW, WIDE = 4.0, 50.0
+"""Ratios of the ends of an axis: a narrow one is linear, a wide one labelled at powers of ten."""
 LONGEST = 40
 """Characters of a name in a legend."""
 
@@ -105,22 +109,17 @@ def _profile(panel: "Axes", outcomes: Sequence[Outcome], key: str) -> None:
             for part in ("value", "low", "high")
         )
         colour = COLOURS[place % len(COLOURS)]
-        panel.step(
-            x, value, where="post", color=colour, linestyle=LINES[place % len(LINES)], label=name
-        )
-        panel.fill_between(x, low, high, step="post", color=colour, alpha=0.15, linewidth=0.0)
-    if levels.min() > 0.0 and end > levels.min():
+        panel.plot(x, value, color=colour, linestyle=LINES[place % len(LINES)], label=name)
+        panel.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0.0)
+    ratio = end / float(levels.min()) if levels.min() > 0.0 else 1.0
+    if ratio > NARROW:
         panel.set_xscale("log")
-        plain_ticks(panel.xaxis, _ticks(end / float(levels.min())))
-    elif measure.sign < 0.0:
+        plain_ticks(panel.xaxis, (1.0,) if ratio > WIDE else (1.0, 3.0))
+        panel.xaxis.set_minor_locator(NullLocator())
+    else:
+        panel.xaxis.set_major_locator(MaxNLocator(4))
+    if measure.sign < 0.0:
         panel.invert_xaxis()
-
-
-def _ticks(ratio: float) -> tuple[float, ...]:
-    """Return the labelled multiples of powers of ten on an axis that spans a ratio."""
-    if ratio > 100.0:
-        return (1.0,)
-    return (1.0, 3.0) if ratio > 10.0 else (1.0, 2.0, 5.0)
 
 
 def differences(outcomes: Sequence[Outcome], width: str) -> Figure:
@@ -163,7 +162,9 @@ def _forest(
             one, y = of(metric), rows[metric.measure.key] + shift
             if not math.isfinite(one.value):
                 continue
-            panel.plot([one.low, one.high], [y, y], color=colour, linewidth=1.4)
+            panel.plot(
+                [one.low, one.high], [y, y], color=colour, linewidth=1.4, solid_capstyle="butt"
+            )
             panel.plot(
                 [one.value], [y], MARKS[place % len(MARKS)], color=colour, markersize=3.5,
                 markeredgewidth=0.0, label=label,
@@ -172,7 +173,7 @@ def _forest(
     panel.set_yticks(range(len(measures)), [f"{m.heading} {m.better}" for m in measures.values()])
     panel.set_ylim(len(measures) - 0.5, -0.5)
     panel.grid(visible=False, axis="y")
-    figure.legend(loc="outside upper left", frameon=False)
+    figure.legend(loc="outside upper left", ncols=PANELS[width] // 2, frameon=False)
     return figure, panel
 
 

@@ -24,6 +24,8 @@ Array = NDArray[Any]
 
 LEVELS = 40
 """Number of levels of a performance profile."""
+SPAN = 1e3
+"""Largest ratio of a profile's levels; less than the least of them is next to nothing."""
 HEAD = 6
 """Number of statistics that every metric has."""
 
@@ -291,9 +293,10 @@ def _sides(
 
 
 def _levels(*losses: Array) -> Array:
-    """Return levels from the least finite loss to the largest, evenly spaced on a log axis.
+    """Return levels up to the largest finite loss, evenly spaced on a log axis.
 
-    Losses that are not all positive have them evenly spaced; without a finite one there are none.
+    They span at most `SPAN`. Where a loss is negative they are evenly spaced from the least one;
+    without a finite loss there are none.
     """
     finite = np.concatenate([one[np.isfinite(one)] for one in losses])
     if not len(finite):
@@ -301,7 +304,11 @@ def _levels(*losses: Array) -> Array:
     low, high = float(finite.min()), float(finite.max())
     if low == high:
         return np.array([low])
-    spaced = np.geomspace(low, high, LEVELS) if low > 0.0 else np.linspace(low, high, LEVELS)
+    if low >= 0.0:
+        low = max(float(finite[finite > 0.0].min()), high / SPAN)
+        spaced = np.geomspace(low, high, LEVELS)
+    else:
+        spaced = np.linspace(low, high, LEVELS)
     # Rounding would leave the largest loss above the last level.
     spaced[[0, -1]] = low, high
     return spaced

@@ -6,6 +6,7 @@ path. Paths that were driven once, as under conditions without chance, are drawn
 their setting.
 """
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import bootstrap
+from scipy.stats import DegenerateDataWarning, bootstrap
 
 from experiments.run.statistics import CONFIDENCE, RESAMPLES, Interval, weighted_interquartile_mean
 
@@ -170,7 +171,9 @@ def estimates(
 
     width = drives * max((1, *trainings))
     resamples = int(min(RESAMPLES, max(FEWEST, MOST_DRAWS // width)))
-    with np.errstate(invalid="ignore"):
+    # Statistics that a resample does not have are NaN, of which SciPy warns.
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", DegenerateDataWarning)
         result = bootstrap(
             samples, of, n_resamples=resamples, batch=max(1, AT_ONCE // width), vectorized=True,
             axis=-1, method="percentile", confidence_level=CONFIDENCE,
