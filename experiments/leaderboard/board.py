@@ -6,6 +6,7 @@ import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ HEADINGS = (
     "agent", "place", "mean rank", "whole path", ("ALE", "m"), ("MLE", "m"), ("predict", "ms"),
     "drives", "trainings", "rerun here",
 )  # fmt: skip
-ORIGIN = ("agent", "revision", "versions", "processor", "system")
+ORIGIN = ("agent", "revision", "versions", "processor", "system", "cost of training")
 NUMERIC = range(1, 9)
 NOTES = (
     (
@@ -96,6 +97,7 @@ class Entry:
     rank: Place | None
     sample: Sequence[str]
 
+    @cached_property
     def scores(self) -> tuple[Score, Score] | None:
         """Return the scores of ALE and MLE; None without drives that all trainings have."""
         if not self.row.shared:
@@ -129,7 +131,7 @@ def entries_of(
 def cells(entry: Entry) -> list[Cell]:
     """Return text and remark of each of `HEADINGS`."""
     row, rank = entry.row, entry.rank
-    scores = entry.scores()
+    scores = entry.scores
     finished = sum(map(regimes.passed, row.cases))
     solver = [case["solver"] for case in row.cases if case["status"] == "ok"]
     return [
@@ -155,7 +157,7 @@ def cells(entry: Entry) -> list[Cell]:
 
 def origin(entry: Entry) -> list[Cell]:
     """Return the columns of `ORIGIN`, as far as manifests have them."""
-    return [_agent(entry.row), *_provenance(entry.row.manifests)]
+    return [_agent(entry.row), *_provenance(entry.row.manifests), _cost(entry.row)]
 
 
 def _agent(row: Row) -> tuple[str, str]:
@@ -197,18 +199,24 @@ def number(value: float, decimals: int) -> str:
     return f"{value:.{decimals}f}" if abs(value) < 1e5 else f"{value:.3g}"
 
 
-def _trainings(row: Row) -> tuple[str, str]:
-    """Return number of trainings and their cost together."""
+def _trainings(row: Row) -> str:
+    """Return the number of trainings; "–" for agents that were not trained, as far as is known."""
+    if not row.seeds:
+        return "1" if row.trained else "–"
+    return str(len(row.seeds))
+
+
+def _cost(row: Row) -> str:
+    """Return the cost of all trainings together."""
     costs = row.trained
     if not costs:
-        return (str(len(row.seeds)), "cost not recorded") if row.seeds else ("–", "")
+        return "not recorded" if row.seeds else "–"
     whole = {
         key: sum(cost[key] for cost in costs)
         for key in ("steps", "seconds", "solves")
         if all(key in cost for cost in costs)
     }
-    together = "together " if len(costs) > 1 else ""
-    return str(max(len(row.seeds), 1)), together + words(whole)
+    return words(whole)
 
 
 def _provenance(manifests: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -239,7 +247,8 @@ def _once(texts: Sequence[str]) -> str:
 def title_of(section: Section) -> str:
     """Return the title of a section: its suite, or paths of drives without one."""
     if section.suite != CUSTOM:
-        return f"Suite {section.suite}"
+        more = f", {section.seeds} seeds" if section.seeds > 1 else ""
+        return f"Suite {section.suite}{more}"
     found = {path_name(case.get("trajectory")) for row in section.rows for case in row.cases}
     names = sorted(found)
     rest = f" and {len(names) - 6} more" if len(names) > 6 else ""

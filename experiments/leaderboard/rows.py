@@ -35,6 +35,8 @@ from trajectories.arguments import shortened
 Array = NDArray[np.float64]
 
 CUSTOM = "custom"
+MOST_SEEDS = 100
+"""Most seeds for which the drives of a suite are found."""
 LONGEST = 120
 """Most characters of a text from a folder that a cell shows."""
 
@@ -144,6 +146,8 @@ class Section:
     ----------
     suite
         Name of the suite; "custom" for folders that were made without one.
+    seeds
+        Number of seeds that the drives are given for; 1 has the fewest that the suite drives.
     drives
         The drives on which its rows are compared.
     rows
@@ -151,6 +155,7 @@ class Section:
     """
 
     suite: str
+    seeds: int
     drives: frozenset[str]
     rows: list[Row]
 
@@ -185,21 +190,33 @@ def sections_of(folders: Sequence[Path], skipped: list[str]) -> list[Section]:
         if not cases:
             skipped.insert(before, f"{folder}: no line of cases.jsonl can be read")
             continue
-        suite = _suite(store.manifest())
-        drives = drives_of_suite(suite) if suite != CUSTOM else frozenset(map(drive_of, cases))
-        section = found.setdefault((suite, _digest(drives)), Section(suite, drives, []))
+        suite, seeds = _suite(store.manifest())
+        own = suite == CUSTOM
+        drives = frozenset(map(drive_of, cases)) if own else drives_of_suite(suite, seeds)
+        section = found.setdefault((suite, _digest(drives)), Section(suite, seeds, drives, []))
         for label, group in by_label(cases).items():
             counted = [case for case in group if drive_of(case) in drives]
             further = len(group) - len(counted)
             section.rows.append(Row(store, name, label, counted, further, len(drives)))
     known = [*suites.SUITES, CUSTOM]
-    return sorted(found.values(), key=lambda section: known.index(section.suite))
+    return sorted(found.values(), key=lambda section: (known.index(section.suite), section.seeds))
 
 
-def _suite(manifest: Mapping[str, Any]) -> str:
+def _suite(manifest: Mapping[str, Any]) -> tuple[str, int]:
+    """Return the suite of a manifest, and the number of seeds with which its drives are found.
+
+    More seeds usually add drives to those of one. Where they are others, as in `limits`, they make
+    a section of their own.
+    """
     settings = manifest.get("settings")
-    suite = settings.get("suite") if isinstance(settings, Mapping) else None
-    return suite if isinstance(suite, str) and suite in suites.SUITES else CUSTOM
+    given = settings if isinstance(settings, Mapping) else {}
+    suite, seeds = given.get("suite"), given.get("seeds")
+    if not isinstance(suite, str) or suite not in suites.SUITES:
+        return CUSTOM, 1
+    count = len(seeds) if isinstance(seeds, list) and 1 <= len(seeds) <= MOST_SEEDS else 1
+    if drives_of_suite(suite, 1) <= drives_of_suite(suite, count):
+        return suite, 1
+    return suite, count
 
 
 def _names(folders: Sequence[str]) -> list[str]:
@@ -214,11 +231,14 @@ def _digest(drives: frozenset[str]) -> str:
 
 
 @cache
-def drives_of_suite(suite: str) -> frozenset[str]:
-    """Return the drives of a suite that it gives to every agent, with as few seeds as it has."""
+def drives_of_suite(suite: str, seeds: int) -> frozenset[str]:
+    """Return the drives of a suite that it gives to every agent, with the seeds 0 to `seeds` - 1.
+
+    Some parts of a suite have more seeds than are asked for.
+    """
     given: dict[str, set[str]] = {}
     for agent in suites.default_agents():
-        for spec in suites.SUITES[suite]((agent,), (0,)):
+        for spec in suites.SUITES[suite]((agent,), range(seeds)):
             given.setdefault(spec["agent"], set()).add(drive_of(Case(**spec).as_dict()))
     most = max(len(own) for own in given.values())
     return frozenset.intersection(

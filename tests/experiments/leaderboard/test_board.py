@@ -8,7 +8,15 @@ from typing import Any
 
 import pytest
 
-from experiments.leaderboard.board import Entry, cells, command_of, entries_of, markdown, page
+from experiments.leaderboard.board import (
+    Entry,
+    cells,
+    command_of,
+    entries_of,
+    markdown,
+    origin,
+    page,
+)
 from experiments.leaderboard.marks import Mark
 from experiments.leaderboard.rows import Section, drives_of_suite, sections_of
 from experiments.run import suites
@@ -23,10 +31,13 @@ def results(
     ]
 
 
-def folder(place: Path, cases: Sequence[dict[str, Any]], suite: str | None = "quick") -> Path:
+def folder(
+    place: Path, cases: Sequence[dict[str, Any]], suite: str | None = "quick", seeds: int = 1
+) -> Path:
     folder_of(place, cases, traces=False)
     manifest = {
-        "settings": {"suite": suite}, "versions": {"numpy": "2.4.0", "python": "3.11.7"},
+        "settings": {"suite": suite, "seeds": list(range(seeds))},
+        "versions": {"numpy": "2.4.0", "python": "3.11.7"},
         "revision": {"commit": "0123456789abcdef", "modified": True},
         "hardware": {"processor": "A processor", "cores": 8, "system": "Linux"},
     }  # fmt: skip
@@ -138,7 +149,8 @@ def test_trainings_are_one_row_with_both_spreads(tmp_path: Path) -> None:
     assert shown[3] == "6 of 6 | by training 2 to 2 of 2"
     assert shown[5] == "0.2750 | drives 0.2750 to 0.2750; trainings 0.1000 to 0.6000"
     assert shown[7] == "2 of 2"
-    assert shown[8] == "3 | together 3.00 k steps, 3 min, 0 solves"
+    assert shown[8] == "3"
+    assert origin(entries[1])[-1] == "3.00 k steps, 3 min, 0 solves"
 
 
 def test_a_training_that_lacks_a_drive_makes_its_row_incomplete(tmp_path: Path) -> None:
@@ -182,11 +194,26 @@ def test_the_command_of_a_row_names_its_sample(tmp_path: Path) -> None:
 def test_drives_of_a_suite_are_those_of_every_agent(suite: str, number: int) -> None:
     """`paper`: the six at variable and at fixed speed and with another car, and 60 in real time;
     raw waypoints are not given to learned policies, and IPOPT's NMPC has six drives in all."""
-    assert len(drives_of_suite(suite)) == number
+    assert len(drives_of_suite(suite, 1)) == number
+
+
+def test_more_seeds_add_drives_or_make_a_section_of_their_own(tmp_path: Path) -> None:
+    """In `quick` seeds add drives; in `limits` paths that meet chance have other seeds then."""
+    one, two = folder(tmp_path / "a", results(0.2)), folder(tmp_path / "b", results(0.1), seeds=2)
+    assert [one.place for one in only(one, two)] == [1, 2]
+    spec = suites.limits(("stanley",), (0,))[0]
+    driven = {**case(1, "stanley"), **spec, "agent": "stanley"}
+    found = board(
+        folder(tmp_path / "c", [driven], "limits"),
+        folder(tmp_path / "d", [driven], "limits", 5),
+        folder(tmp_path / "e", [driven], "limits", 10_000),
+    )
+    assert [(section.seeds, len(entries)) for section, entries in found] == [(1, 2), (5, 1)]
+    assert [len(section.drives) for section, _ in found] == [580, 741]
 
 
 def test_every_suite_has_drives_for_every_agent() -> None:
-    assert min(len(drives_of_suite(suite)) for suite in suites.SUITES) >= 2
+    assert min(len(drives_of_suite(suite, 1)) for suite in suites.SUITES) >= 2
 
 
 def test_a_folder_that_is_none_or_given_twice_is_refused(tmp_path: Path) -> None:
