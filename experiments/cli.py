@@ -21,6 +21,7 @@ COMMANDS = {
     "benchmark": "Run agents x trajectories x seeds, print the paper's table, write report.html.",
     "reproduce": "Run cases of a results folder again, and compare every value bit for bit.",
     "report": "Rebuild the table and report.html from saved cases alone.",
+    "merge": "Join folders of results, such as the shards of one benchmark, in one.",
     "leaderboard": "Build one page and Markdown of result folders; a sample of each row is rerun.",
     "compare": "Compare folders of results, or agents within one, drive by drive: table, LaTeX, "
     "figures.",

@@ -1,6 +1,7 @@
 """`lpv-track benchmark`: agents x trajectories x seeds, the paper's table, and a report."""
 
 import argparse
+import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 EXAMPLE = "lpv-track benchmark --agents stanley lqr --trajectories T1 T2 --out results/mine"
 MOST_WARNINGS = 10
 """Different warnings of the drives that are printed."""
+MOST_COMPARED = 500
+"""Different warnings that are looked through for repetitions."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -54,14 +57,31 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "end an agent that is stuck in native code",
     )  # fmt: skip
     parser.add_argument(
+        "--traces", choices=("all", "drawn", "none"), default="all",
+        help="traces/ID.npz of all cases (default), of those that a report draws, or none",
+    )  # fmt: skip
+    parser.add_argument(
+        "--shard", type=_shard, metavar="I/N",
+        help="only every N-th case from the I-th on, for batch systems; each shard has an --out of "
+        "its own, and lpv-track merge joins them",
+    )  # fmt: skip
+    parser.add_argument(
         "--resume", action="store_true", help="keep the cases that DIR holds already"
     )
+
+
+def _shard(text: str) -> tuple[int, int]:
+    """Read the number of a shard and the number of shards."""
+    found = re.fullmatch(r"0*([1-9]\d{0,5})/0*([1-9]\d{0,5})", text, re.ASCII)
+    if found is None or int(found[1]) > int(found[2]):
+        raise argparse.ArgumentTypeError("must be I/N with 1 <= I <= N, such as 2/8")
+    return int(found[1]), int(found[2])
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the cases, print the tables, write the report; return 1 if a case failed, else 0."""
     from experiments.run import suites
-    from experiments.run.benchmark import CASE_LIMIT, distinct, run_benchmark, selected
+    from experiments.run.benchmark import CASE_LIMIT, distinct, run_benchmark, selected, shard
     from experiments.run.case import Case
     from experiments.run.training_folders import expanded, first_training, is_folder
     from trajectories.naming import choose
@@ -101,6 +121,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
         "suite": suite, "agents": names, "seeds": list(seeds), **common,
         "agent_settings": shared.parse_settings(options.agent_set),
     }  # fmt: skip
+    if options.shard is not None:
+        specs = shard(specs, *options.shard)
+        settings["shard"] = "{}/{}".format(*options.shard)
     if options.env:
         # Refuse values that the environment does not accept before anything is driven.
         Case(**specs[0]).check()
@@ -110,6 +133,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
             specs, options.out, engine=shared.engine_of(options), settings=settings,
             resume=options.resume, console=console,
             limit=CASE_LIMIT if options.case_limit is None else options.case_limit,
+            traces=options.traces,
         )  # fmt: skip
     return finish(store, selected(store, specs), console)
 
@@ -126,7 +150,8 @@ def finish(store: "ResultStore", cases: Sequence[Mapping[str, Any]], console: Co
     # The files that were just driven with; the folder may name others.
     named = {str(case.get(key)) for case in cases for key in ("trajectory", "vehicle")}
     report = write_report(store.folder, NamedFiles(frozenset(named)))
-    texts = dict.fromkeys(str(text) for case in cases for text in case.get("warnings", ()))
+    every = dict.fromkeys(str(text) for case in cases for text in case.get("warnings", ()))
+    texts = list(every)[:MOST_COMPARED]
     # The same warning stands there with and without the name of its file.
     told = [one for one in texts if not any(one != more and more.endswith(one) for more in texts)]
     for text in told[:MOST_WARNINGS]:

@@ -81,7 +81,7 @@ class BaseCase(ABC):
         """
         digests = [file_digest(file) for file in self.present_files()]
         versions = computing_versions(*self.packages())
-        content = json.dumps([self.as_dict(), digests, project_digest(), versions], sort_keys=True)
+        content = json.dumps([vars(self), digests, project_digest(), versions], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
     def packages(self) -> tuple[str, ...]:

@@ -225,6 +225,15 @@ class ResultStore:
         """Return the manifest of the last run, or {} without a readable one."""
         return _manifest(self.folder / "manifest.json")
 
+    def manifests(self) -> dict[str, dict[str, Any]]:
+        """Return the manifests of the last run and of earlier ones by their keys."""
+        files = [self.folder / "manifest.json", *sorted(self.folder.glob("manifest-*.json"))]
+        found: dict[str, dict[str, Any]] = {}
+        for manifest in filter(None, map(_manifest, files)):
+            if is_key(key := str(manifest.get("key", "before"))):
+                found.setdefault(key, manifest)
+        return found
+
     def manifest_of(self, key: str) -> dict[str, Any]:
         """Return the manifest with a key, that of the last run or an earlier one; {} without it.
 
