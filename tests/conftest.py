@@ -17,7 +17,7 @@ SLOW = (
     "agents/weight_tuning", "campaigns", "experiments/commands", "experiments/parallel",
     "experiments/report/test_report_browser", "experiments/ros", "experiments/run/test_computing",
     "experiments/run/test_engines", "experiments/run/test_learning_cost",
-    "experiments/run/test_rollout", "experiments/speed", "experiments/study",
+    "experiments/run/test_ray_engine", "experiments/run/test_rollout", "experiments/speed", "experiments/study",
     "experiments/training", "experiments/tuning", "experiments/verify", "experiments/test_",
     "lpv_track_env/conditions/test_conditions_episode", "lpv_track_env/estimation",
     "lpv_track_env/highway", "lpv_track_env/test_plants", "lpv_track_env/test_rendering",

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from experiments.commands.options import (
-    MOST_WORKERS,
+    add_engine,
     add_out,
     amount,
+    engine_of,
     file_name,
     resumable,
     whole,
@@ -41,10 +42,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--tracks", type=file_name, metavar="DIR",
         help="folder of TUMFTM centre lines (x_m,y_m,...): one more set",
     )  # fmt: skip
-    parser.add_argument(
-        "--workers", type=whole(1, MOST_WORKERS), default=2, metavar="N",
-        help="processes (default 2)",
-    )  # fmt: skip
+    add_engine(parser)
     parser.add_argument(
         "--quick", action="store_true",
         help="2 trainings of 60,000 solves, 2 drives a path, small oracles: a preview",
@@ -82,7 +80,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from experiments.study.report import write_report
     from experiments.study.study import run_evaluations, run_trainings
 
-    study = study_of(options)
+    study, engine = study_of(options), engine_of(options)
     with study.claimed(), resumable(options, console), progress_bar(console) as progress:
 
         def follow(words: str, steps: Iterator[tuple[int, int]]) -> None:
@@ -91,8 +89,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
                 progress.update(bar, completed=done, total=count or 1)
             progress.update(bar, completed=1, total=1)
 
-        follow("trainings", run_trainings(study, options.workers))
-        follow("evaluations", run_evaluations(study, options.workers))
+        follow("trainings", run_trainings(study, engine))
+        follow("evaluations", run_evaluations(study, engine))
         headroom, greedy = study_oracles(study, progress, quick=options.quick)
     report = study.folder / "report.html"
     summary = write_report(study, headroom, greedy, report)

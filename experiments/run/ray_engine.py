@@ -11,6 +11,7 @@ import math
 import os
 import pickle
 import secrets
+import socket
 import time
 import warnings
 from collections import Counter
@@ -34,7 +35,7 @@ from experiments.run.worker_process import (
     Run,
     Spec,
 )
-from trajectories.arguments import shortened
+from trajectories.arguments import shortened, shown
 
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -116,22 +117,38 @@ def connected(workers: int | None, address: str | None) -> Iterator[None]:
             "address": "local", "num_cpus": workers or os.cpu_count() or 1,
             "include_dashboard": False, "object_store_memory": STORE,
         }  # fmt: skip
-    else:
-        options["address"] = address
     try:
+        if address is not None:
+            _reach(address)
+            options["address"] = address
         ray.init(**options)
     except (OSError, RuntimeError, ValueError) as error:
-        reason = shortened(error)
+        where = "on this computer" if address is None else f"at {shown(address)}"
         raise ValueError(
-            "Ray cannot be started on this computer: " + reason
-            if address is None
-            else f"no Ray cluster that can be used at {address} ({reason}): start one with ray "
-            "start --head, and run the command on a computer of it"
+            f"no Ray {where} ({shortened(error, 120)}): on a cluster run ray start --head, and "
+            "this command on one of its computers, see docs/benchmark.md"
         ) from None
     try:
         yield
     finally:
         ray.shutdown()
+
+
+def _reach(address: str) -> None:
+    """Check that something listens at an address, for which Ray itself would wait for minutes.
+
+    Raises
+    ------
+    OSError
+        If nothing does.
+    ValueError
+        If it is neither HOST:PORT nor "auto".
+    """
+    host, _, port = address.rpartition(":")
+    if address != "auto":
+        if not host or not port.isdecimal():
+            raise ValueError("give HOST:PORT, as ray start prints it, or auto")
+        socket.create_connection((host, int(port)), timeout=PATIENCE).close()
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from typing import Any, cast
 from experiments.run import provenance, shipping
 from experiments.run.folder_lock import locked
 from experiments.run.worker_process import (
+    PATIENCE,
     Identity,
     Run,
     Worker,
@@ -141,6 +142,8 @@ class Host:
     def close(self) -> None:
         """End the child and remove the folder."""
         self.end()
+        if self._child is not None:
+            self._child.process.join(PATIENCE)
         self._stack.close()
 
 

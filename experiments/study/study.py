@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from agents.weight_tuning.policy import load
 from experiments.jobs.job import PROGRESS, Line, Listener, read_lines
-from experiments.run.engines import local_pool
+from experiments.run.engines import Engine
 from experiments.run.folder_lock import locked
 from experiments.run.store import read_arrays, write_arrays
 from experiments.study.evaluation import FIGURES, EvaluationSet, Evaluator
@@ -181,9 +181,13 @@ class Study:
         """Return the folder of a training."""
         return self.folder / "trainings" / f"{file_name(label)}-{seed}"
 
+    def evaluations(self, name: str) -> Path:
+        """Return the folder of the evaluations on a set."""
+        return self.folder / "judged" / file_name(name)
+
     def evaluation(self, name: str, label: str, seed: int) -> Path:
         """Return the file of a training's evaluation on a set."""
-        return self.folder / "judged" / file_name(name) / f"{file_name(label)}-{seed}.npz"
+        return self.evaluations(name) / f"{file_name(label)}-{seed}.npz"
 
     def trainings(self) -> list[tuple[Rung, int]]:
         """Return all trainings, the longest first so that a pool ends evenly."""
@@ -245,7 +249,7 @@ def evaluate_one(spec: Mapping[str, Any]) -> dict[str, Any]:
     return {"set": given.name}
 
 
-def run_trainings(study: Study, workers: int) -> Iterator[tuple[int, int]]:
+def run_trainings(study: Study, engine: Engine) -> Iterator[tuple[int, int]]:
     """Run the missing trainings; yields (done, all) after each."""
     specs = [
         {
@@ -256,11 +260,12 @@ def run_trainings(study: Study, workers: int) -> Iterator[tuple[int, int]]:
         if not ((folder := study.training(rung.label, seed)) / WEIGHTS).exists()
     ]  # fmt: skip
     yield 0, len(specs)
-    for k, _ in enumerate(local_pool(specs, workers, run=train_one, failed=_died)):
+    ended = engine.run(specs, train_one, failed=_died, folder=_folder)
+    for k, _ in enumerate(ended):
         yield k + 1, len(specs)
 
 
-def run_evaluations(study: Study, workers: int) -> Iterator[tuple[int, int]]:
+def run_evaluations(study: Study, engine: Engine) -> Iterator[tuple[int, int]]:
     """Run the missing evaluations; yields (done, all) after each block."""
     specs = []
     for given in study.sets:
@@ -269,10 +274,23 @@ def run_evaluations(study: Study, workers: int) -> Iterator[tuple[int, int]]:
             for rung, seed in study.trainings()
             if not (file := study.evaluation(given.name, rung.label, seed)).exists()
         ]
-        specs += [{"set": given, "todo": todo[k : k + BLOCK]} for k in range(0, len(todo), BLOCK)]
+        folder = str(study.evaluations(given.name))
+        specs += [
+            {"set": given, "folder": folder, "todo": todo[k : k + BLOCK]}
+            for k in range(0, len(todo), BLOCK)
+        ]
     yield 0, len(specs)
-    for k, _ in enumerate(local_pool(specs, workers, run=evaluate_one, failed=_died)):
+    ended = engine.run(specs, evaluate_one, failed=_died, files=_weights, folder=_folder)
+    for k, _ in enumerate(ended):
         yield k + 1, len(specs)
+
+
+def _folder(spec: Mapping[str, Any]) -> Path:
+    return Path(spec["folder"])
+
+
+def _weights(spec: Mapping[str, Any]) -> list[Path]:
+    return [Path(weights) for _, weights, _ in spec["todo"]]
 
 
 def _died(spec: Mapping[str, Any], error: str) -> dict[str, Any]:

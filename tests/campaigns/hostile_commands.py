@@ -55,7 +55,10 @@ BASES: dict[str, list[str]] = {
 }
 """A command line of each command that works; `report` and `bag` get files that are made first."""
 
-ENGINES = ("experiments.run.engines.local_pool", "experiments.run.engines.in_process")
+ENGINES = (
+    "experiments.run.engines.local_pool", "experiments.run.engines.in_process",
+    "experiments.run.ray_engine.run_on_ray",
+)  # fmt: skip
 LONG: dict[str, tuple[str, ...]] = {
     "ablation": ENGINES,
     "latency": ENGINES,

@@ -20,6 +20,7 @@ from agents.weights import TrackingWeights, WeightSchedule
 from experiments.cli import parser
 from experiments.commands.tune import settings_of
 from experiments.run.case import Case, run_case
+from experiments.run.engines import Engine
 from experiments.run.metrics import evaluate
 from experiments.run.rollout import rollout
 from experiments.run.store import write_arrays
@@ -241,7 +242,6 @@ def fixture_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Study:
         for label in LABELS
     }
     monkeypatch.setattr(study, "rung_of", short.__getitem__)
-    monkeypatch.setattr(study, "local_pool", lambda specs, _, run, **__: map(run, specs))
     few = EvaluationSet(
         "few, short", ("circle", "sine"), "simulation", 2, env_settings={"time_limit": 1.0}
     )
@@ -257,12 +257,12 @@ def test_a_study_is_made_read_and_not_made_again(short: Study) -> None:
     assert [(one.label, seed) for one, seed in short.trainings()] == [
         ("rl", 0), ("rl", 1), ("default", 0), ("search", 0), ("search", 1),
     ]  # fmt: skip
-    assert list(run_trainings(short, 1)) == [(k, 5) for k in range(6)]
-    assert list(run_evaluations(short, 1)) == [(0, 1), (1, 1)]
+    assert list(run_trainings(short, Engine(1))) == [(k, 5) for k in range(6)]
+    assert list(run_evaluations(short, Engine(1))) == [(0, 1), (1, 1)]
     made = times(short.folder)
     assert len(made) == 10
-    assert list(run_trainings(short, 1)) == [(0, 0)]
-    assert list(run_evaluations(short, 1)) == [(0, 0)]
+    assert list(run_trainings(short, Engine(1))) == [(0, 0)]
+    assert list(run_evaluations(short, Engine(1))) == [(0, 0)]
     assert times(short.folder) == made
 
     for label in LABELS:
@@ -286,8 +286,8 @@ def test_a_study_is_made_read_and_not_made_again(short: Study) -> None:
     score = short.read("few, short", "search")["score"]
     lost.unlink()
     short.evaluation("few, short", "search", 0).unlink()
-    assert list(run_trainings(short, 1)) == [(0, 1), (1, 1)]
-    assert list(run_evaluations(short, 1)) == [(0, 1), (1, 1)]
+    assert list(run_trainings(short, Engine(1))) == [(0, 1), (1, 1)]
+    assert list(run_evaluations(short, Engine(1))) == [(0, 1), (1, 1)]
     now = times(short.folder)
     assert {name for name in made if now[name] != made[name]} == {
         "trainings/search-0/weights.json", "judged/few-short/search-0.npz",
