@@ -170,11 +170,9 @@ def summary(verdicts: Iterable["Verdict"]) -> str:
     for exact in (True, False):
         group = [verdict for verdict in compared if verdict.exact == exact]
         values, equal = sum(one.values for one in group), sum(one.equal for one in group)
-        way = (
-            "bit for bit"
-            if exact
-            else f"within {RELATIVE:g} of the value or {ABSOLUTE:g} ({equal} equal bit for bit)"
-        )
+        way = "bit for bit"
+        if not exact:
+            way = f"within {RELATIVE:g} of the value or {ABSOLUTE:g} ({equal} equal bit for bit)"
         if group:
             parts.append(f"{_count(len(group), 'case')}, {_count(values, 'value')} {way}")
     different = [verdict for verdict in compared if verdict.differences]

@@ -19,6 +19,7 @@ from experiments.run.case import BaseCase, Case, failed_case, run_case
 from experiments.run.engines import Engine
 from experiments.run.exact import OUTCOMES, values_of
 from experiments.run.foreign import opened_by
+from experiments.run.metrics import BANDS
 from experiments.run.provenance import changes_since, manifest_key
 from experiments.run.result_schema import read_case
 from experiments.run.tables import conditions_words, path_name
@@ -30,8 +31,12 @@ from trajectories.fileio import parse_json
 Result = Mapping[str, Any]
 Spec = Mapping[str, Any]
 
-RELATIVE, ABSOLUTE = 1e-6, 1e-9
-"""Tolerances of numbers that were computed with other versions or on another processor."""
+RELATIVE, ABSOLUTE = 1e-4, 1e-9
+"""Tolerances of numbers that were computed with other versions or on another processor.
+
+Between the lowest and newest versions of the packages, the largest relative difference was 4e-12 in
+20 drives in simulation and 3.4e-6 in 240 under realistic conditions of up to six minutes.
+"""
 ALTERED = "its fields or files were changed after it was driven"
 MEASURED = "delays are measured on the machine and differ from run to run"
 
@@ -303,7 +308,10 @@ def _files(spec: Spec) -> list[Path]:
 
 
 def judged(row: Row, result: Result, *, exact: bool) -> Verdict:
-    """Compare a row with the result of its case here, bit for bit if `exact`."""
+    """Compare a row with the result of its case here, bit for bit if `exact`.
+
+    Within the tolerance, metrics of curvature bands are left out: they jump at the bands' edges.
+    """
     there, here = dict(values_of(row.result)), dict(values_of(result))
     error = str(row.result.get("error") or "")
     if error.startswith((LATE, DIED)) and here.get("error") != error:
@@ -313,6 +321,9 @@ def judged(row: Row, result: Result, *, exact: bool) -> Verdict:
     if there.get("status", "ok") != here["status"]:
         # Why it failed, not every value that is missing for that.
         names = [name for name in ("status", "end", "error") if name in there or name in here]
+    if not exact:
+        # The last digit decides to which band a place at its edge belongs.
+        names = [name for name in names if name.rpartition("_")[2] not in BANDS.names]
     pairs = [(name, there.get(name), here.get(name)) for name in names]
     lines = [
         f"{name} {_shown(old)} there, {_shown(new)} here"
