@@ -14,6 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from trajectories.arguments import shortened
+
 PACKAGES = (
     "lpv-track-env", "numpy", "scipy", "numba", "llvmlite", "casadi", "gymnasium", "torch",
     "stable-baselines3", "highway-env", "cma", "piqp", "rosbags", "commonroad-vehicle-models",
@@ -138,7 +140,7 @@ def changes_since(before: Mapping[str, Any], packages: Sequence[str]) -> dict[st
     """Return in words what differs here from a manifest: `versions`, `sources`, `processor`.
 
     What the manifest does not tell counts as different. Versions are those of `packages`; Python
-    counts by its minor version.
+    counts by its minor version. Texts of the manifest, which anybody may have written, are cut.
     """
     changed = _changed_versions(before, ("python", *packages))
     versions = [
@@ -159,21 +161,23 @@ def changes_since(before: Mapping[str, Any], packages: Sequence[str]) -> dict[st
     if not isinstance(known, list):
         found["processor"] = ["processor features not known"]
     elif there.get("architecture") != name or set(map(str, known)) != set(features):
-        words = [f"processor {there.get('architecture')} there, {name} here"]
+        words = [f"processor {shortened(there.get('architecture'), 40)} there, {name} here"]
         for place, more, less in (("there", known, features), ("here", features, known)):
             if only := [one for one in map(str, more) if one not in less]:
-                words.append(f"with {' '.join(only)} only {place}")
+                words.append(f"with {shortened(' '.join(only), 60)} only {place}")
         found["processor"] = [" ".join(words)]
     return found
 
 
 def _changed_versions(
     before: Mapping[str, Any], names: Sequence[str]
-) -> list[tuple[str, Any, str | None]]:
+) -> list[tuple[str, str | None, str | None]]:
     """Return name, version in a manifest and version here of the packages where they differ."""
     then, now = _entry(before, "versions"), versions()
     return [
-        (name, then.get(name), now.get(name)) for name in names if then.get(name) != now.get(name)
+        (name, shortened(then[name], 40) if name in then else None, now.get(name))
+        for name in names
+        if then.get(name) != now.get(name)
     ]
 
 
@@ -188,11 +192,10 @@ def _minor(version: object) -> list[str]:
 
 def _sources(told: Mapping[str, Any]) -> str:
     """Say which sources a manifest's `revision` tells of."""
-    words = [str(told["sources"])] if told.get("sources") else []
+    words = [shortened(told["sources"], 40)] if told.get("sources") else []
     if told.get("commit"):
-        words.append(
-            f"(commit {str(told['commit'])[:12]}{', modified' * bool(told.get('modified'))})"
-        )
+        changed = ", modified" if told.get("modified") else ""
+        words.append(f"(commit {shortened(str(told['commit'])[:12])}{changed})")
     return " ".join(words)
 
 

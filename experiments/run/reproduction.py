@@ -204,7 +204,8 @@ def _case_to_run(result: Result, open_named_files: bool) -> BaseCase:
         raise NotRunError(MEASURED)
     if next(values_of(result), None) is None:
         raise ValueError("the result holds no value to compare")
-    case.id  # noqa: B018  raises for a file that cannot be read
+    if named:
+        case.id  # noqa: B018  raises for a file that cannot be read
     return case
 
 

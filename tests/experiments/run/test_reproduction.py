@@ -535,6 +535,17 @@ def test_a_manifest_says_what_has_changed() -> None:
     assert name
     for damaged in ({}, {"versions": 3, "revision": [], "hardware": {"features": "avx"}}):
         assert all(len(words) == 1 for words in changes_since(damaged, ()).values())
+    trap = "\x1b[2J" * 10_000
+    hostile = {
+        "versions": {"numpy": trap, "python": [trap]},
+        "revision": {"sources": trap, "commit": trap},
+        "hardware": {"architecture": trap, "features": [trap] * 3},
+    }
+    told = "; ".join(
+        word for words in changes_since(hostile, ("numpy",)).values() for word in words
+    )
+    assert told.isprintable()
+    assert len(told) < 1500
 
 
 @pytest.mark.slow  # highway-env compiles and draws its roads
