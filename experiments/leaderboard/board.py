@@ -40,9 +40,10 @@ NOTES = (
     (
         "In every drive the rows are ranked: one that fails is behind all that pass, and those "
         "that pass by the first figure of their regime (MLE; from a start ALE; entry speed; "
-        "fastest lap). The mean rank counts every regime alike, and in suites without regimes "
-        "every setting; its 95 % interval is a bootstrap over the drives of each. It depends on "
-        "who else is on the board."
+        "fastest lap). An agent with several trainings has the mean rank of one of them. The "
+        "mean rank counts every regime alike, and in suites without regimes every setting; its "
+        "95 % interval is a bootstrap over the drives of each, and over trainings. It depends "
+        "on who else is on the board."
     ),
     (
         "ALE and MLE, the root mean square and the largest lateral error, are interquartile "
@@ -57,16 +58,18 @@ NOTES = (
     (
         "Rerun here: a sample of the row's cases was run again on the machine that made this "
         "page. Where versions, sources and processor are those of the row, every bit must be "
-        "the same; elsewhere values must agree to 1e-6. A row of which a case does not "
-        "reproduce, or of which an id does not fit what the case says it drove, has no place. A "
-        "sample proves nothing of the rest: the command below each table runs the same sample "
-        "again, and without --id all."
+        "the same; elsewhere values must agree within the tolerance of lpv-track reproduce. A "
+        "row of which a case does not reproduce, or of which an id does not fit what the case "
+        "says it drove, has no place. A sample proves nothing of the rest: the command below "
+        "each table runs the same sample again, and without --id all."
     ),
 )
 FROM_OTHERS = (
-    "To add a row, hand in the folder that lpv-track benchmark --suite NAME has written: "
-    "cases.jsonl and manifest.json; traces are not needed. With your own agent or policy, add "
-    "the file."
+    "Run a suite with your agent beside some others, such as lpv-track benchmark --suite limits "
+    "--agents lpv-nmpc my_controllers.py:Mine --out results/mine, and hand in cases.jsonl and "
+    "manifest.json of that folder; traces are not needed. An agent of your own can only be run "
+    "again with its file, its policy or its weights: hand them in, too. Whoever makes the page "
+    "gives the command all folders, yours among them."
 )
 LONGEST_LINE = 20_000
 """Characters of the longest JSON line of a case that the page shows."""
@@ -283,8 +286,8 @@ def page(
             joined([sources, _commands(entries)]),
         )
         document.section(title_of(section), joined([table, again]))
-    notes = [skipped_note(skipped), *map(paragraph, (*NOTES, FROM_OTHERS))]
-    document.section("How it is made", joined(notes))
+    document.section("How it is made", joined([skipped_note(skipped), *map(paragraph, NOTES)]))
+    document.section("How to add a row", paragraph(FROM_OTHERS))
     return document.render(title, subtitle)
 
 
@@ -324,7 +327,7 @@ def markdown(
     parts.append("## How it is made")
     if skipped:
         parts.append(f"Left out, because it cannot be read: {escaped('; '.join(skipped[:5]))}.")
-    parts += [escaped(text) for text in (*NOTES, FROM_OTHERS)]
+    parts += [*map(escaped, NOTES), "## How to add a row", escaped(FROM_OTHERS)]
     return "\n\n".join(parts) + "\n"
 
 
