@@ -93,7 +93,13 @@ def add_job(parser: argparse.ArgumentParser, folder: str) -> None:
     """Add the options that trainings and tunings share; `folder` is the default of `--out`."""
     parser.add_argument("--out", type=file_name, metavar="DIR", help=f"default: {folder}")
     parser.add_argument("--resume", action="store_true", help="go on from the last state in DIR")
-    parser.add_argument("--seed", type=whole(0, 999), default=0, help="0 to 999 (default 0)")
+    seeds = parser.add_mutually_exclusive_group()
+    seeds.add_argument("--seed", type=whole(0, 999), default=0, help="0 to 999 (default 0)")
+    seeds.add_argument(
+        "--seeds", type=whole(0, 999), nargs="+", metavar="SEED",
+        help="one for each of these seeds, side by side, in DIR/seed-SEED",
+    )  # fmt: skip
+    add_engine(parser)
     parser.add_argument("--vehicle", metavar="NAME", help="preset or .json (default m2-minibus)")
     add_control_period(parser)
     parser.add_argument("--preview-steps", type=PREVIEW_STEPS, metavar="K", help="default 20")
@@ -144,6 +150,24 @@ def engine_of(options: argparse.Namespace) -> Engine:
         For an address without the engine that it belongs to.
     """
     return Engine(options.workers, options.engine, options.address)
+
+
+def seeds_of_jobs(options: argparse.Namespace) -> list[int] | None:
+    """Return the seeds of `--seeds` of a training or tuning; None for a single one.
+
+    Raises
+    ------
+    ValueError
+        For a seed that is given twice, and for an engine without `--seeds`.
+    """
+    engine = engine_of(options)
+    if options.seeds is None:
+        if engine != Engine():
+            raise ValueError("--workers, --engine and --address are for several: give --seeds")
+        return None
+    if len(set(options.seeds)) < len(options.seeds):
+        raise ValueError(f"--seeds names a seed twice: {' '.join(map(str, options.seeds))}")
+    return list(options.seeds)
 
 
 def add_start(parser: argparse.ArgumentParser) -> None:

@@ -13,21 +13,23 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from experiments.commands.options import (
+    EXIT_FAILED,
     MOST_PATHS,
     MOST_STEPS,
     add_job,
     add_settings,
     add_trajectories,
     amount,
+    engine_of,
     number,
     parse_settings,
     resumable,
+    seeds_of_jobs,
     whole,
 )
 from experiments.training import ALGORITHMS
 
 if TYPE_CHECKING:
-    from experiments.jobs.job import Line
     from experiments.training.settings import TrainingSettings
 
 EXAMPLE = "lpv-track train ppo --seed 0 --hours 0.1 --out results/ppo"
@@ -97,8 +99,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--from",
         dest="start",
         metavar="POLICY",
-        help="policy file to start from, e.g. of bc; ppo fits its value function alone in the "
-        "first segment",
+        help="policy file to start from, e.g. of bc, or a folder of trainings: that of the same "
+        "seed; ppo fits its value function alone in the first segment",
     )
     add_settings(
         parser, "--set",
@@ -149,12 +151,17 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from experiments.jobs.console import TrainingDisplay, check_resume, need
 
     need("training", "rl", "stable_baselines3", "torch", "tensorboard")
+    from experiments.jobs.curves import TRAINING, draw
     from experiments.jobs.job import SETTINGS, stored_settings
+    from experiments.jobs.several import start_of
     from experiments.training.loop import POLICY, train
     from experiments.training.settings import with_steps
     from trajectories.fileio import checked
 
     folder = options.out = options.out or Path("results/train") / options.algorithm
+    if (seeds := seeds_of_jobs(options)) is not None:
+        return run_several(options, seeds, console)
+    options.start = start_of(options.start, options.seed)
     resumed = check_resume(folder, "training", resume=options.resume)
     settings = settings_of(options)
     at_most = math.inf
@@ -175,7 +182,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
             seconds_at_most=at_most,
         )  # fmt: skip
     last = lines[-1]
-    draw(lines, folder / "training.png")
+    draw({settings.seed: lines}, TRAINING, "steps", folder / "training.png")
     console.out(
         f"{last['steps']:,} steps in {last['seconds']:.0f} s, {last['learning_seconds']:.0f} s of "
         f"them learning ({last['steps'] / last['learning_seconds']:,.0f} steps a second), "
@@ -183,6 +190,34 @@ def run(options: argparse.Namespace, console: Console) -> int:
         highlight=False,
     )
     return 0
+
+
+def run_several(options: argparse.Namespace, seeds: Sequence[int], console: Console) -> int:
+    """Train once for each seed; return 1 if a training failed, else 0."""
+    from experiments.jobs.console import TrainingDisplay
+    from experiments.jobs.curves import TRAINING
+    from experiments.jobs.job import PROGRESS, read_lines
+    from experiments.jobs.several import Kind, run_seeds
+    from experiments.training.loop import train
+
+    if options.hours is not None:
+        raise ValueError("--hours is the budget of one training: give --steps with --seeds")
+
+    def job_of(own: argparse.Namespace) -> tuple["TrainingSettings", str]:
+        settings = settings_of(own)
+        return settings, command_line(settings, own)
+
+    def display(settings: Any, *given: Any) -> TrainingDisplay:
+        console, progress, prefix = given
+        return TrainingDisplay(console, settings.algorithm, settings.steps, progress, prefix)
+
+    def finished(settings: Any, folder: Path) -> bool:
+        return (folder / PROGRESS).exists() and len(read_lines(folder)) >= settings.segments
+
+    kind = Kind("training", train, display, finished, TRAINING, "steps")
+    with resumable(options, console, "the same command with --resume"):
+        failed = run_seeds(kind, options, seeds, job_of, engine_of(options), console)
+    return EXIT_FAILED if failed else 0
 
 
 def command_line(settings: "TrainingSettings", options: argparse.Namespace) -> str:
@@ -231,33 +266,3 @@ def trial_of(settings: "TrainingSettings") -> "TrainingSettings":
     if "learning_starts" in hyper:
         hyper["learning_starts"] = once
     return replace(settings, steps=3 * short, segment=short, hyperparameters=hyper)
-
-
-def draw(lines: Sequence["Line"], file: Path) -> None:
-    """Draw ALE and steering of the validation drives over the steps."""
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import EngFormatter
-
-    from experiments.figures import COLOURS, save_figure
-
-    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    steps = [line["steps"] for line in lines]
-    for axes, key, label in (
-        (left, "mean_ale", "ALE m, mean of validation drives"),
-        (right, "mean_steering_variation", "steering variation rad, mean"),
-    ):
-        values = [line["validation"][key] for line in lines]
-        axes.plot(steps, values, color=COLOURS[0], marker=".")
-        best = [k for k, line in enumerate(lines) if line["best"]][-1]
-        axes.plot(steps[best], values[best], "o", color=COLOURS[1], label="kept")
-        axes.set(xlabel="steps", ylabel=label)
-        axes.grid(alpha=0.3)
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    # The first policies leave the road: the scale is that of the later half.
-    left.set_ylim(
-        0.0, 1.3 * max(line["validation"]["mean_ale"] for line in lines[len(lines) // 2 :])
-    )
-    left.legend()
-    figure.suptitle(f"{lines[-1]['seconds']:.0f} s, {lines[-1]['solves']:,} NMPC solves")
-    save_figure(figure, file)

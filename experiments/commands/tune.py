@@ -2,20 +2,24 @@
 
 import argparse
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from experiments.commands.options import (
+    EXIT_FAILED,
     MOST_PATHS,
     add_conditions,
     add_job,
     add_settings,
     amount,
+    engine_of,
     number,
     parse_settings,
     resumable,
+    seeds_of_jobs,
     whole,
 )
 from experiments.tuning import METHODS
@@ -137,6 +141,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from experiments.tuning.loop import WEIGHTS, tune
 
     folder = options.out = options.out or Path("results/tune") / options.method
+    if (seeds := seeds_of_jobs(options)) is not None:
+        return run_several(options, seeds, console)
     check_resume(folder, "tuning", resume=options.resume)
     settings = settings_of(options)
 
@@ -153,6 +159,31 @@ def run(options: argparse.Namespace, console: Console) -> int:
         highlight=False,
     )
     return 0
+
+
+def run_several(options: argparse.Namespace, seeds: Sequence[int], console: Console) -> int:
+    """Tune once for each seed; return 1 if a tuning failed, else 0."""
+    from experiments.jobs.console import TuningDisplay
+    from experiments.jobs.curves import TUNING
+    from experiments.jobs.several import Kind, run_seeds
+    from experiments.tuning.loop import WEIGHTS, tune
+
+    def job_of(own: argparse.Namespace) -> tuple["TuningSettings", str]:
+        settings = settings_of(own)
+        return settings, command_line(settings, own)
+
+    def display(settings: Any, *given: Any) -> TuningDisplay:
+        console, progress, prefix = given
+        return TuningDisplay(console, settings.method, settings.solves, progress, prefix)
+
+    def finished(_settings: Any, folder: Path) -> bool:
+        # Written when no step is left.
+        return (folder / WEIGHTS).exists()
+
+    kind = Kind("tuning", tune, display, finished, TUNING, "solves")
+    with resumable(options, console, "the same command with --resume"):
+        failed = run_seeds(kind, options, seeds, job_of, engine_of(options), console)
+    return EXIT_FAILED if failed else 0
 
 
 def command_line(settings: "TuningSettings", options: argparse.Namespace) -> str:

@@ -8,36 +8,47 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
+from experiments.jobs.curves import of_finished
 from experiments.jobs.job import Line, Listener, stored_settings
 from experiments.run.benchmark import progress_bar
 
 
 class Display(Listener):
-    """Shows the progress of a job: a bar on a terminal, printed lines everywhere."""
+    """Shows the progress of a job: a bar on a terminal, printed lines everywhere.
 
-    def __init__(self, console: Console, total: int) -> None:
-        self.progress: Progress = progress_bar(console)
-        self._console, self._total = console, total
-        self._bar = self.progress.add_task("paths", total=None)
+    Of several jobs, each has a bar of a common `progress`, and a `prefix` of its lines.
+    """
+
+    def __init__(
+        self, console: Console, total: int, progress: Progress | None = None, prefix: str = ""
+    ) -> None:
+        self.progress = progress_bar(console) if progress is None else progress
+        self._console, self._total, self._prefix = console, total, prefix
+        self._bar = self.progress.add_task(f"{prefix}paths", total=None)
 
     def loading(self, done: int, count: int) -> None:
         """Show how many of all paths are loaded."""
-        self.progress.update(self._bar, description="paths", completed=done, total=count)
+        words = f"{self._prefix}paths"
+        self.progress.update(self._bar, description=words, completed=done, total=count)
 
     def show(self, done: int, words: str) -> None:
         """Show how much of the total is done, and a few words on it."""
+        words = f"{self._prefix}{words}"
         self.progress.update(self._bar, description=words, completed=done, total=self._total)
 
     def say(self, text: str) -> None:
         """Print a line."""
-        self._console.print(text, markup=False, highlight=False)
+        self._console.print(f"{self._prefix}{text}", markup=False, highlight=False)
 
 
 class TrainingDisplay(Display):
     """Prints a line for every segment."""
 
-    def __init__(self, console: Console, algorithm: str, steps: int) -> None:
-        super().__init__(console, steps)
+    def __init__(
+        self, console: Console, algorithm: str, steps: int, progress: Progress | None = None,
+        prefix: str = "",
+    ) -> None:  # fmt: skip
+        super().__init__(console, steps, progress, prefix)
         self._algorithm = algorithm
 
     def tick(self, done: int, words: str) -> None:
@@ -46,19 +57,24 @@ class TrainingDisplay(Display):
 
     def line(self, line: Line) -> None:
         """Print the validation after a segment."""
-        validation = line["validation"]
+        validation, ale = line["validation"], of_finished(line, "mean_ale")
+        error = "–" if ale is None else f"{ale:.4f} m"
+        self.show(line["steps"], self._algorithm)
         self.say(
             f"{line['steps']:>11,} steps {line['seconds']:5.0f} s  "
             f"loss {validation['loss']:7.4f}  finished {validation['finished']:4.0%}  "
-            f"ALE {validation['mean_ale']:.4f} m{'  best' if line['best'] else ''}"
+            f"ALE {error:<8}{'  best' if line['best'] else ''}".rstrip()
         )
 
 
 class TuningDisplay(Display):
     """Prints a line for every tenth of the budget."""
 
-    def __init__(self, console: Console, method: str, solves: int) -> None:
-        super().__init__(console, solves)
+    def __init__(
+        self, console: Console, method: str, solves: int, progress: Progress | None = None,
+        prefix: str = "",
+    ) -> None:  # fmt: skip
+        super().__init__(console, solves, progress, prefix)
         self._method, self._solves, self._printed = method, solves, 0
 
     def line(self, line: Line) -> None:

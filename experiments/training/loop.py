@@ -236,8 +236,10 @@ def cases(settings: TrainingSettings, policy: Path) -> list[dict[str, Any]]:
 def validate(settings: TrainingSettings, policy: Path) -> dict[str, float]:
     """Drive the validation cases; return the share that finished, ALE and MLE (m), steering.
 
-    `loss`, by which the best policy is chosen, is 1 minus the reward per second of all drives
-    together: perfect tracking earns the training's reward at a rate of 1 a second.
+    Errors and steering are those of the drives that finished, and are left out if none did: a
+    vehicle that leaves the road at once has small ones. `loss`, by which the best policy is chosen,
+    is 1 minus the reward per second of all drives together: perfect tracking earns the training's
+    reward at a rate of 1 a second.
 
     Raises
     ------
@@ -249,16 +251,19 @@ def validate(settings: TrainingSettings, policy: Path) -> dict[str, float]:
         if result["status"] != "ok":
             raise ValueError(f"validation on {result['trajectory']}: {result['error']}")
     finished = np.array([result["end"] == "finished" for result in results])
-    ale = np.array([result["metrics"]["ale"] for result in results])
     reward, seconds = (
         sum(result["metrics"][key] for result in results) for key in ("reward", "duration")
     )
+    figures = {"loss": 1.0 - reward / seconds, "finished": float(finished.mean())}
+    if not finished.any():
+        return figures
+    ale, mle, steering = (
+        np.array([one["metrics"][key] for one in results])[finished]
+        for key in ("ale", "mle", "steering_variation")
+    )
     return {
-        "loss": 1.0 - reward / seconds,
-        "finished": float(finished.mean()),
+        **figures,
         "mean_ale": float(ale.mean()),
-        "worst_mle": float(max(result["metrics"]["mle"] for result in results)),
-        "mean_steering_variation": float(
-            np.mean([result["metrics"]["steering_variation"] for result in results])
-        ),
+        "worst_mle": float(mle.max()),
+        "mean_steering_variation": float(steering.mean()),
     }

@@ -211,5 +211,5 @@ class TuningDrives:
 
 
 def threads() -> int:
-    """Return the number of threads of compiled drives: two, or fewer on a smaller processor."""
-    return min(2, int(numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    """Return the number of threads of compiled drives: two, or fewer if there are not as many."""
+    return min(2, numba.get_num_threads())

@@ -342,7 +342,7 @@ def test_the_command_trains_resumes_and_refuses(
     assert command(*words) == 0
     said = capsys.readouterr().out
     assert "512 steps" in said
-    assert "m  best\n" in said
+    assert "  best\n" in said
     assert (tmp_path / "out" / "training.png").read_bytes().startswith(b"\x89PNG")
     again = read_policy(tmp_path / "out" / "policy.json").training["command"]
     assert again == (
@@ -496,3 +496,26 @@ def test_without_the_extra_it_says_what_to_install(
     error = capsys.readouterr().err
     assert "stable_baselines3, tensorboard: pip install 'lpv-track-env[rl]'" in error
     assert error.count("\n") == 1
+
+
+def test_errors_of_a_validation_are_those_of_drives_that_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A vehicle that leaves the road at once has an error of nearly zero."""
+    ends = iter(["left_corridor", "finished"] + 2 * ["left_corridor"])
+
+    def drive(_case: dict[str, Any]) -> dict[str, Any]:
+        end = next(ends)
+        error = 0.25 if end == "finished" else 1e-6
+        metrics = {"ale": error, "mle": 2 * error, "steering_variation": 8 * error}
+        return {
+            "status": "ok", "end": end, "metrics": {**metrics, "reward": 5.0, "duration": 10.0},
+        }  # fmt: skip
+
+    monkeypatch.setattr("experiments.training.loop.run_case", drive)
+    settings = tiny("ppo", conditions=("simulation",), validation=2)
+    assert validate(settings, tmp_path) == {
+        "loss": 0.5, "finished": 0.5, "mean_ale": 0.25, "worst_mle": 0.5,
+        "mean_steering_variation": 2.0,
+    }  # fmt: skip
+    assert validate(settings, tmp_path) == {"loss": 0.5, "finished": 0.0}
