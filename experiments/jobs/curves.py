@@ -69,7 +69,7 @@ def draw(runs: Runs, curves: Sequence[Curve], budget: str, file: Path) -> None:
         panels[0].legend(handles, labels)
     last = [lines[-1] for lines in runs.values()]
     for axes in panels:
-        axes.set_xlim(0.0, 1.03 * max(max(line[budget] for line in last), 1))
+        axes.set_xlim(0.0, 1.03 * max(1, *(line[budget] for line in last)))
     seconds, solves = sum(line["seconds"] for line in last), sum(line["solves"] for line in last)
     several = f"{len(runs)} trainings, " if len(runs) > 1 else ""
     figure.suptitle(f"{several}{seconds:,.0f} s, {solves:,} NMPC solves")

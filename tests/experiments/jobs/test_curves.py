@@ -83,5 +83,5 @@ def test_nothing_finished_is_said_in_the_picture(
     draw({0: [line(EARLIER, best=True)]}, TRAINING, "steps", tmp_path / "none.png")
     finished, ale, _ = figures[0].axes
     assert [text.get_text() for text in ale.texts] == ["no drive finished"]
-    assert finished.texts == []
+    assert not list(finished.texts)
     np.testing.assert_array_equal(finished.lines[0].get_ydata(), [0.0])
