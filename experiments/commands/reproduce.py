@@ -53,7 +53,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     """Run the cases, print each difference; return 1 for one or for a damaged row, else 0."""
     from experiments.run.reproduction import prepared, sampled
 
-    results, manifest_of, torn, damaged = _results(options)
+    results, manifest_of, torn, damaged = _results(options, console)
     rows = prepared(
         results, manifest_of,
         open_named_files=options.open_named_files, whole=options.folder != STDIN,
@@ -70,7 +70,11 @@ def run(options: argparse.Namespace, console: Console) -> int:
     try:
         _run(options, console, chosen, verdicts)
     except KeyboardInterrupt:
-        _print(console, f"interrupted: {len(verdicts)} of {len(chosen)} cases were run again")
+        _print(
+            console,
+            f"interrupted: {len(verdicts)} of {len(chosen)} cases were run again; --sample N draws "
+            "fewer",
+        )
         _print(console, summary(verdicts))
         raise
     _print(console, summary(verdicts))
@@ -78,7 +82,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
     return 1 if different or damaged or rows.damaged else 0
 
 
-def _results(options: argparse.Namespace) -> tuple[list[Any], Any, list[str], list[str]]:
+def _results(
+    options: argparse.Namespace, console: Console
+) -> tuple[list[Any], Any, list[str], list[str]]:
     """Return the wanted results, the reader of their manifests, a torn line, damaged lines."""
     from experiments.run.reproduction import pasted, torn_line
     from experiments.run.store import ResultStore
@@ -87,7 +93,9 @@ def _results(options: argparse.Namespace) -> tuple[list[Any], Any, list[str], li
     torn: list[str] = []
     damaged: list[str] = []
     if options.folder == STDIN:
-        text = sys.stdin.read(MOST_BYTES + 1)
+        if sys.stdin.isatty():
+            console.out("results as JSON, then Ctrl-D:", highlight=False)
+        text = sys.stdin.read(MOST_BYTES + 1).removeprefix("\ufeff")
         if len(text) > MOST_BYTES:
             raise ValueError(f"standard input: at most {MOST_BYTES} characters are read")
         found: Sequence[Mapping[str, Any]] = pasted(text)
@@ -128,9 +136,9 @@ def _run(
             _print_verdict(console, verdict)
             progress.advance(bar)
             done = len(verdicts)
-            if not console.is_terminal and STEPS * done // len(rows) > STEPS * (done - 1) // len(
-                rows
-            ):
+            # Piped: a line every 5 % of the cases.
+            shares = {STEPS * count // len(rows) for count in (done - 1, done)}
+            if not console.is_terminal and len(shares) > 1:
                 elapsed = time.perf_counter() - began
                 _print(console, f"[{done}/{len(rows)}, {elapsed:.0f} s] {verdict.row.words}")
 

@@ -3,6 +3,7 @@
 import os
 import re
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any
 
 import trajectories
@@ -25,15 +26,15 @@ def opened_by(result: Mapping[str, Any]) -> list[str]:
     """Return the names of all files and modules that running a result's case would open or execute.
 
     They are the agent unless it is one of this project's, whose code would run, and the files of
-    its settings, of the path and of the vehicle. Nothing is opened or imported to find out.
+    settings, of the path and of the vehicle. Nothing is opened or imported to find out.
     """
     found = []
     if "agent" in result and result["agent"] not in (*agent_names(), *OWN):
         found.append(str(result["agent"]))
-    settings = result.get("agent_settings") or {}
+    settings = [(result.get(key) or {}).values() for key in ("agent_settings", "env_settings")]
     found += [
         value
-        for value in settings.values()
+        for value in chain(*settings)
         if isinstance(value, str) and (FILE_LIKE.search(value) or os.path.exists(value))  # noqa: PTH110
     ]
     if "trajectory" in result and is_path_file(str(result["trajectory"])):

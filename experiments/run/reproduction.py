@@ -35,12 +35,10 @@ RELATIVE, ABSOLUTE = 1e-4, 1e-9
 """Tolerances of numbers that were computed with other versions or on another processor.
 
 Between the lowest and newest versions of the packages, the largest relative difference was 4e-12 in
-20 drives in simulation and 3.4e-6 in 240 under realistic conditions of up to six minutes.
+20 drives in simulation and 3.4e-6 in 240 of some minutes under realistic conditions.
 """
 ALTERED = "its fields or files were changed after it was driven"
 MEASURED = "delays are measured on the machine and differ from run to run"
-
-
 SAME: Mapping[str, Sequence[str]] = {"versions": (), "sources": (), "processor": ()}
 """What differs where the manifest's key is that of this machine."""
 

@@ -289,7 +289,10 @@ def test_ctrl_c_says_how_far_it_came(
     monkeypatch.setattr("experiments.run.reproduction.reproduce", pressed)
     code, said = again(folder)
     assert code == 130
-    assert "interrupted: 1 of 3 cases were run again\ncompared: 1 case, " in said
+    assert (
+        "interrupted: 1 of 3 cases were run again; --sample N draws fewer\ncompared: 1 case, "
+        in said
+    )
 
 
 def test_a_case_of_two_results_is_run_once(folder: Path) -> None:
@@ -347,7 +350,7 @@ def test_a_pasted_line_is_reproduced(folder: Path, paste: Reproduce) -> None:
     assert "bit for bit: equal" in said
     # A page may break it anywhere.
     wrapped = "\r\n".join(line[k : k + 61] for k in range(0, len(line), 61))
-    assert paste(f"  {wrapped}\n\n") == (code, said)
+    assert paste(f"\ufeff  {wrapped}\n\n") == (code, said)
 
 
 def test_fields_and_metrics_that_a_pasted_result_lacks(folder: Path, paste: Reproduce) -> None:
@@ -432,11 +435,14 @@ def test_nothing_that_a_stranger_names_is_opened_or_run(
         {**given, "trajectory": "random-1e9"},
         {**given, "vehicle": "car.json"},
         {"scene": "racetrack", "agent": "trap.py:Own", "end": "finished"},
+        {"scene": "racetrack", "agent": "pid", "end": "", "env_settings": {"vehicle": "a.json"}},
     ]
     code, said = paste("\n".join(map(json.dumps, rows)))
     assert code == 2
     assert "no result of - can be run again" in said
-    assert said.count("--open-named-files does, for results you trust") == len(rows) - 2
+    assert (
+        said.count("--open-named-files does, for results you trust") == len(rows) - 2
+    )  # two have an agent, two a file in common
     assert "2 results: to run it again would open or execute 'trap.py:Own'" in said
     assert not Path("sprung").exists()
     assert all(opened_by(row) for row in rows)
