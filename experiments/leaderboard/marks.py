@@ -113,8 +113,8 @@ def _mark(verdicts: Sequence[Verdict], not_run: Sequence[str]) -> Mark:
             Mark("– not rerun", next(iter([*notes, *not_run]), "")) if notes or not_run else Mark()
         )
     count = f"({len(compared)} of {len(verdicts) + len(not_run)})"
-    inexact = [one for one in compared if not one.exact]
-    if inexact:
-        remark = "; ".join(filter(None, [origin_words(inexact[0].row), left, *notes[:1]]))
+    elsewhere = [origin_words(one.row) for one in compared if not one.exact]
+    remark = "; ".join([*elsewhere[:1], *filter(None, [left]), *notes[:1]])
+    if any(not one.exact and one.equal < one.values for one in compared):
         return Mark(f"✓ within {reproduction.RELATIVE:g} {count}", remark)
-    return Mark(f"✓ bit for bit {count}", "; ".join(filter(None, [left, *notes[:1]])))
+    return Mark(f"✓ bit for bit {count}", remark)

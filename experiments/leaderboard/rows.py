@@ -93,7 +93,7 @@ class Row:
             found.setdefault(training_of(case), {})[drive_of(case)] = case
         return found
 
-    @property
+    @cached_property
     def shared(self) -> list[str]:
         """Drives that it has, of several trainings those that all have."""
         if not self.cases:
@@ -117,7 +117,7 @@ class Row:
         ]
         return np.array(of_training, dtype=np.float64).reshape(len(self.by_training), -1)
 
-    @property
+    @cached_property
     def plan(self) -> Plan:
         """What a bootstrap of the shared drives draws."""
         if not self.cases:

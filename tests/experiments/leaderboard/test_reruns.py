@@ -108,11 +108,15 @@ def test_other_versions_are_compared_within_a_tolerance(folder: Path) -> None:
 
     def elsewhere(case: dict[str, Any]) -> None:
         case["manifest"], case["id"] = "0123abcd", f"{case['id'][:-4]}beef"
+
+    def slightly_off(case: dict[str, Any]) -> None:
         case["metrics"]["ale"] *= 1.0 + 1e-12
 
     changed(folder, elsewhere, slice(None))
+    changed(folder, slightly_off, slice(0, 2))
     code, rows = board(folder)
     assert code == 0
+    assert rows["pid"][-1].startswith("✓ bit for bit (2 of 2)<br>numpy 1.0.0 ")
     assert rows["stanley"][-1].startswith("✓ within 0.0001 (2 of 2)<br>numpy 1.0.0 ")
 
     def off(case: dict[str, Any]) -> None:
