@@ -39,12 +39,13 @@ from trajectories.arguments import shortened, shown
 
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     # All of what Ray prints about other processes, such as the log of a node that was lost.
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".",
 }
-"""Environment that keeps Ray's own messages off the screen, and a local Ray on this computer."""
+"""Environment that keeps Ray's own messages off the screen, and GPUs visible."""
+LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
+"""Environment of a Ray that only this computer reaches."""
 STORE = 2**29
 """Memory for objects of a local Ray, bytes; more goes to disk."""
 TURN = 1.0
@@ -101,7 +102,8 @@ def connected(workers: int | None, address: str | None) -> Iterator[None]:
 
     Where this process uses a Ray already, that one is used.
     """
-    os.environ.update({key: value for key, value in QUIET.items() if key not in os.environ})
+    wanted = QUIET | LOOPBACK if address is None else QUIET
+    os.environ.update({key: value for key, value in wanted.items() if key not in os.environ})
     try:
         import ray
     except ModuleNotFoundError:
@@ -207,7 +209,8 @@ class _Sweep:
         self._deaths: Counter[int] = Counter()
         self._losses: Counter[int] = Counter()
         self._hands: list[_Hand] = []
-        self._begun: set[int] = set()
+        self._again: set[int] = set()
+        """Specs that wait again."""
         self._refused: dict[str, str] = {}
         self._looked, self._greeted = -math.inf, time.monotonic()
         self._said = False
@@ -372,8 +375,9 @@ class _Sweep:
             hand.copied = time.monotonic()
             order["folder"], order["known"] = str(folder), hand.known
         hand.number, hand.at = number, hand.actor.run.remote(order, given, content)
-        if number not in self._begun:
-            self._begun.add(number)
+        if number in self._again:
+            self._again.remove(number)
+        else:
             self._started(spec)
 
     def _object(self, digest: str, content: bytes) -> Any:
@@ -397,7 +401,7 @@ class _Sweep:
             return []
         number = self._finish(hand)
         if answer["kind"] == "refused":
-            self._fresh.append(number)
+            self._wait_again(number, self._fresh)
             reason = answer["content"]
             if reason == OTHER_ID:
                 reason += f" ({self._changed(hand.versions) or 'a module of its own differs'})"
@@ -406,6 +410,10 @@ class _Sweep:
         if "changes" in answer:
             self._apply(hand, answer["changes"])
         return self._result(number, answer)
+
+    def _wait_again(self, number: int, among: list[int]) -> None:
+        among.append(number)
+        self._again.add(number)
 
     def _finish(self, hand: _Hand) -> int:
         """Free a hand of its spec, and return that one's number."""
@@ -426,7 +434,7 @@ class _Sweep:
             self._deaths[number] += 1
             if self._deaths[number] > 1:
                 return [failed(spec, DIED)]
-            self._suspects.append(number)
+            self._wait_again(number, self._suspects)
             return []
         return [pickle.loads(answer["content"])]  # noqa: S301  from a worker of our own
 
@@ -442,7 +450,7 @@ class _Sweep:
         self._losses[number] += 1
         if self._losses[number] == MOST_LOSSES:
             return [self._task.failed(self._specs[number], LOST)]
-        (self._fresh if self._losses[number] == 1 else self._suspects).append(number)
+        self._wait_again(number, self._fresh if self._losses[number] == 1 else self._suspects)
         return []
 
     # Folders --------------------------------------------------------------------------------------

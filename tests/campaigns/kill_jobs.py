@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 from experiments.jobs import checkpoint
 from experiments.jobs.job import read_lines
+from experiments.run.result_schema import plain
 from experiments.run.store import ResultStore
 from tests.campaigns import Counts, Say
 
@@ -57,15 +58,18 @@ class Job(NamedTuple):
     workers: bool = False
 
 
-def _cases(folder: Path) -> int:
+def cases_held(folder: Path) -> int:
+    """Return the number of cases in a folder; raises if it cannot be read."""
     store = ResultStore(folder)
     return len(store.cases())
 
 
-def _benchmark(folder: Path) -> Facts:
+def benchmark_facts(folder: Path) -> Facts:
+    """Return all results of a folder but times, and the number of its lines."""
     store = ResultStore(folder)
     facts: dict[str, Any] = {"lines": store.cases_file.read_bytes().count(b"\n")}
-    for case in store.cases():
+    for stored in store.cases():
+        case = plain(stored, "case")
         for name in ("median", "p99", "max"):
             case["solver"].pop(name)
         trace = store.trace(case["id"])
@@ -111,7 +115,7 @@ JOBS = {
     "benchmark": Job(
         ["benchmark", "--agents", "stanley", "pid", "--trajectories", "u-turn", "straight",
          "--seeds", "3", "--workers", "2"],
-        r"^\[(\d+)/", _cases, _benchmark, workers=True,
+        r"^\[(\d+)/", cases_held, benchmark_facts, workers=True,
     ),
     "train": Job(
         ["train", "ppo", "--steps", "2048", "--segment", "256", "--envs", "8", "--conditions",
@@ -172,7 +176,7 @@ class Running:
     def left(self) -> list[int]:
         """Return the processes of the command that are still there after a while."""
         until = time.monotonic() + GONE
-        while (found := _session(self.process.pid)) and time.monotonic() < until:
+        while (found := processes_of(self.process.pid)) and time.monotonic() < until:
             time.sleep(0.02)
         return found
 
@@ -182,7 +186,7 @@ class Running:
         return max((int(number.replace(",", "")) for number in found), default=0)
 
 
-def _session(leader: int) -> list[int]:
+def processes_of(leader: int) -> list[int]:
     """Return the living processes of a session."""
     found = []
     for entry in Path("/proc").glob("[0-9]*/stat"):
@@ -277,7 +281,7 @@ class Campaign:
             if not running.process.is_alive():
                 return None
             if what == "worker":
-                workers = [one for one in _session(pid) if one != pid]
+                workers = [one for one in processes_of(pid) if one != pid]
                 for worker in workers[: 1 + self.rng.randrange(2)]:
                     os.kill(worker, signal.SIGKILL)
                 return running.end()

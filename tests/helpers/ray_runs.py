@@ -16,13 +16,13 @@ STORE = 80_000_000
 @contextmanager
 def cluster(nodes: int = 2) -> Iterator[Any]:
     """A Ray cluster of nodes with one CPU each on this computer."""
-    from experiments.run.ray_engine import QUIET
+    from experiments.run.ray_engine import LOOPBACK, QUIET
 
-    os.environ.update(QUIET)
+    os.environ.update(QUIET | LOOPBACK)
     from ray.cluster_utils import Cluster
 
     head = {"include_dashboard": False, "include_log_monitor": False}
-    made = Cluster(initialize_head=True, head_node_args={**head, **node(0 if nodes == 0 else 1)})
+    made = Cluster(initialize_head=True, head_node_args={**head, **node(1)})
     try:
         for _ in range(nodes - 1):
             made.add_node(**node(1))
