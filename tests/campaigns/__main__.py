@@ -15,6 +15,7 @@ CAMPAIGNS = {
     "hostile_arguments": (3_000, "arguments of wrong types and absurd values"),
     "kill_jobs": (100, "kill -9 of benchmark, train and tune at random moments"),
     "kill_ray": (20, "nodes of a Ray cluster and drivers killed at random moments"),
+    "many_cases": (100_000, "cases in one folder: memory and time of resume, report, compare"),
     "soak": (10_000_000, "steps of vector environments with all settings"),
 }
 

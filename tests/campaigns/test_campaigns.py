@@ -10,7 +10,7 @@ from tests.campaigns.__main__ import CAMPAIGNS
 SMALL = {
     "hostile_solves": 200, "hostile_files": 200, "hostile_commands": 10, "kill_jobs": 3,
     "kill_ray": 2,
-    "soak": 20_000, "hostile_arguments": 15,
+    "soak": 20_000, "hostile_arguments": 15, "many_cases": 20,
 }  # fmt: skip
 
 
