@@ -20,6 +20,7 @@ from experiments.report.page import (
 from experiments.report.svg_charts import BOTTOM, TOP, Chart, Scale, decades
 from experiments.run import tables
 from experiments.run.console_tables import BAND_NOTE, Line, band_lines, band_ranges
+from experiments.run.excerpts import of_paths
 from experiments.run.metrics import BANDS, published_row
 from experiments.run.tables import (
     EFFORT,
@@ -76,12 +77,14 @@ def _agent_figures(document: Document, cases: Sequence[Result], rows: Sequence[R
         if family_of(case) == family
     }
     styles = condition_styles(list(dict.fromkeys(conditions.values())))
+    of_setting = tables.by_setting(rows)
     parts = []
     for key, axis, name in ERRORS:
         ours = [
             row
-            for row in rows
-            if row.setting in conditions and not row.published and key in row.values
+            for setting in conditions
+            for row in of_paths(of_setting.get(setting, []))[0]
+            if not row.published and key in row.values
         ]
         if ours:
             parts.append(
@@ -149,6 +152,7 @@ def _ends(value: Estimate) -> tuple[float, float]:
 
 def _tables(document: Document, setting: Setting, rows: Sequence[Row]) -> str:
     """Return the paper's table, with effort, constraints and further columns folded away."""
+    rows, left_out = of_paths(rows)
     ours = [row for row in rows if not row.published]
     spreads = f"; {SPREADS}" if any(row.trainings > 1 for row in ours) else ""
     texts: dict[str, Callable[[Row], str]] = {"end": lambda row: row.end}
@@ -171,7 +175,9 @@ def _tables(document: Document, setting: Setting, rows: Sequence[Row]) -> str:
             f"Beyond the paper's columns, {setting}{spreads}.", html_rows(ours, known, {})
         ),
     ]
-    return joined([tracking, folded("Effort, constraints and further figures", joined(further))])
+    note = paragraph(left_out, "soft") if left_out else ""
+    folds = folded("Effort, constraints and further figures", joined(further))
+    return joined([note, tracking, folds])
 
 
 def _trained(row: Row) -> str:

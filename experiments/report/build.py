@@ -106,6 +106,9 @@ def build(
     rows = tables.build_rows(kept)
     manifest = store.manifest()
     drives, missing = drives_of(kept, store, files)
+    settings = manifest.get("settings")
+    if isinstance(settings, Mapping) and settings.get("traces") in ("drawn", "none"):
+        missing = []
     styles = line_styles(tables.labels(kept))
     document = Document()
     notes = joined([skipped_note(skipped), closed_note(kept, files)])
@@ -188,7 +191,7 @@ def manifest_section(
     if isinstance(command, list):
         parts.append(f'<pre tabindex="0">{html.escape(" ".join(map(str, command)))}</pre>')
     seeds = sorted({case.get("seed", 0) for case in cases})
-    lines = [("seeds", ", ".join(map(str, seeds)))]
+    lines = _flattened(seeds, "seeds")
     if manifest:
         entries = _flattened({**manifest, "command": None})
         lines += [(name, value) for name, value in entries if value != "None"]
@@ -210,6 +213,6 @@ def _flattened(value: Any, name: str = "") -> list[tuple[str, str]]:
         ]
     if isinstance(value, list):
         words = ", ".join(map(str, value[:LONGEST_LIST]))
-        rest = f" … ({len(value)} in manifest.json)" if len(value) > LONGEST_LIST else ""
+        rest = f" … ({len(value)} in all)" if len(value) > LONGEST_LIST else ""
         return [(name, words + rest)]
     return [(name, str(value))]

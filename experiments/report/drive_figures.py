@@ -56,6 +56,8 @@ ELONGATED = 0.08
 """Ratio of a path's extents below which it would look like a line on equal scales."""
 MAGNIFIED_SHARE = 0.06
 """Share of a path's extent to which the largest deviation is magnified."""
+SHOWN = 24
+"""Number of cases that a note names."""
 POINTS = 600
 """Points of a path that are drawn."""
 CONDITIONS = (LineStyle(0, 0, 2.2), LineStyle(1, 0, 1.2))
@@ -288,9 +290,11 @@ def _not_drawn(drives: Sequence[Drive], missing: Sequence[Result]) -> str:
     if missing:
         names = ", ".join(
             f"{tables.case_name(case)} on {case.get('trajectory')} (seed {case.get('seed')})"
-            for case in missing
+            for case in missing[:SHOWN]
         )
-        parts.append(paragraph(f"Not drawn, because their traces cannot be read: {names}.", "bad"))
+        rest = f" … and {len(missing) - SHOWN} more" if len(missing) > SHOWN else ""
+        words = f"Not drawn, because their traces cannot be read: {names}{rest}."
+        parts.append(paragraph(words, "bad"))
     return joined(parts)
 
 

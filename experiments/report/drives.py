@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trajectories
-from experiments.report.page import first_open
+from experiments.report.page import first_open, joined, paragraph
 from experiments.run import tables
+from experiments.run.excerpts import MOST_SETTINGS, first_and_worst
 from experiments.run.foreign import is_path_file
 from experiments.run.store import ResultStore
 from experiments.run.tables import Result, Setting
@@ -27,6 +28,8 @@ TRACE = (
     "acceleration", "steering_angle", "solve_time",
 )  # fmt: skip
 """Arrays that a trace must hold to be drawn."""
+MOST_DRIVES = 3000
+"""Most drives whose traces are read."""
 LEAD = "lpv-nmpc"
 """Agent whose figures come first, if it has driven."""
 
@@ -154,14 +157,20 @@ def drives_of(
 ) -> tuple[list[Drive], list[Result]]:
     """Return the first seed's drive of every agent, setting and path, and cases without a trace.
 
-    `files` says which files of paths and vehicles may be opened.
+    Of many paths those of `drawn_paths` count, of many drives the first `MOST_DRIVES`. `files` says
+    which files of paths and vehicles may be opened.
     """
+    cases = list(cases)
+    drawn = drawn_paths(cases)
     drives: dict[tuple[Setting, str, str], Drive] = {}
     missing: list[Result] = []
     for case in cases:
+        if case.get("status") != "ok" or len(drives) == MOST_DRIVES:
+            continue
         label, path = tables.label_of(case), str(case.get("trajectory"))
-        key = tables.setting_of(case), path, label
-        if case.get("status") != "ok" or key in drives:
+        setting = tables.setting_of(case)
+        key = setting, path, label
+        if key in drives or path not in drawn[setting.family]:
             continue
         trace = store.trace(str(case["id"]))
         if trace is None or not usable(trace):
@@ -169,6 +178,17 @@ def drives_of(
             continue
         drives[key] = Drive(label, path, case, trace, files)
     return list(drives.values()), missing
+
+
+def drawn_paths(cases: Iterable[Result]) -> dict[Setting, set[str]]:
+    """Return the paths of each family that are drawn, see `excerpts.first_and_worst`."""
+    errors: dict[Setting, dict[str, float]] = {}
+    for case in cases:
+        found = errors.setdefault(family_of(case), {})
+        path = str(case.get("trajectory"))
+        error = case["metrics"].get("mle", np.inf) if case.get("status") == "ok" else np.inf
+        found[path] = max(error, found.get(path, 0.0))
+    return {family: set(first_and_worst(found)) for family, found in errors.items()}
 
 
 def family_of(case: Result) -> Setting:
@@ -192,11 +212,15 @@ def per_setting(
 ) -> str:
     """Join content(setting, its cases): the main family's shown, other settings folded away."""
     family = main_family(cases)
+    groups = list(tables.cases_by_setting(cases).items())
     parts = [
-        (family_of(group[0]) == family, content(setting, group))
-        for setting, group in tables.cases_by_setting(cases).items()
+        (setting.family == family, content(setting, group))
+        for setting, group in groups[:MOST_SETTINGS]
     ]
-    return first_open([part for part in parts if part[1]], "Other settings")
+    note = ""
+    if len(groups) > MOST_SETTINGS:
+        note = paragraph(f"{MOST_SETTINGS} of {len(groups)} settings are shown.", "soft")
+    return joined([first_open([part for part in parts if part[1]], "Other settings"), note])
 
 
 def families(drives: Iterable[Drive]) -> list[Family]:

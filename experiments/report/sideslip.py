@@ -24,6 +24,7 @@ from experiments.report.page import (
 )
 from experiments.report.svg_charts import Chart, around, decimate, exactly, spread
 from experiments.run import tables
+from experiments.run.excerpts import MOST_LISTED
 from experiments.run.tables import Result
 from lpv_track_env.bicycle import VX, VY, X, Y
 from lpv_track_env.vehicle import VehicleParameters
@@ -71,9 +72,13 @@ def required_sideslip(drive: Drive) -> tuple[Array, Array] | None:
 
 def reaches_limit(case: Result) -> bool:
     """Return whether |vy| <= ratio vx was violated, or a plan needed slack on it."""
+    return _excess(case) > EXCESS
+
+
+def _excess(case: Result) -> float:
+    """Return the larger of the excess over the limit and the slack that a plan needed, m/s."""
     slack = case.get("solver", {}).get("slack") or (0.0, 0.0, 0.0)
-    excess = case.get("metrics", {}).get("excess_lateral_velocity", 0.0)
-    return bool(excess > EXCESS or slack[1] > EXCESS)
+    return float(max(case.get("metrics", {}).get("excess_lateral_velocity", 0.0), slack[1]))
 
 
 def sideslip_section(
@@ -98,11 +103,15 @@ def sideslip_section(
         parts.append(paragraph("No case broke the limit or needed slack on it."))
         return joined(parts)
     by_id = {drive.case["id"]: drive for drive in drives}
+    listed = reached
+    if len(reached) > MOST_LISTED:
+        parts.append(paragraph(f"{MOST_LISTED} of {len(reached)} cases are listed: the worst."))
+        listed = sorted(reached, key=_excess, reverse=True)[:MOST_LISTED]
     table = document.table(
         "Cases that broke the limit, or whose plans needed slack on it. “Needed” is the share "
         "of the path's length whose curvature requires more than the limit at the reference "
         "speed; “at the limit” is the length driven at 99 % of it or more.",
-        _reached(reached, by_id),
+        _reached(listed, by_id),
     )
     parts.append(table if len(reached) <= FEW else folded(f"{len(reached)} cases", table))
     drawn = [by_id[case["id"]] for case in reached if case["id"] in by_id]

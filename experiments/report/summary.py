@@ -2,7 +2,7 @@
 
 import html
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Sized
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from experiments.run.console_tables import (
     over_seeds,
     with_interval,
 )
+from experiments.run.excerpts import MOST_LISTED
 from experiments.run.statistics import rate_interval
 from experiments.run.tables import Result
 
@@ -240,16 +241,23 @@ def failures_section(document: Document, cases: Sequence[Result]) -> str:
     parts = [paragraph(END_NOTE), ends]
     if failed:
         headings = ("id", "agent", "path", "setting", "seed", "error")
-        parts.append(document.table("Failed cases.", html_table(headings, failed, (4,), (5,))))
+        first = f"Failed cases{_of(failed)}."
+        parts.append(document.table(first, html_table(headings, failed[:MOST_LISTED], (4,), (5,))))
     if warnings:
-        lines = [[str(count), text] for text, count in sorted(warnings.items())]
+        common = sorted(warnings.most_common(MOST_LISTED))
+        lines = [[str(count), text] for text, count in common]
         parts.append(
             document.table(
-                "Warnings, and the number of cases that gave them.",
+                f"Warnings, and the number of cases that gave them{_of(warnings)}.",
                 html_table(("cases", "warning"), lines, (0,), (1,)),
             )
         )
     return joined(parts)
+
+
+def _of(every: Sized) -> str:
+    """Return how many of many entries are listed, in words; "" where all are."""
+    return f", {MOST_LISTED} of {len(every)}" if len(every) > MOST_LISTED else ""
 
 
 def _end_line(label: str, cases: Sequence[Result]) -> list[str]:

@@ -21,6 +21,7 @@ from rich.progress import (
 
 from experiments.run.case import BaseCase, Case, failed_case, run_case
 from experiments.run.engines import Engine, Interrupts
+from experiments.run.excerpts import MOST_PATHS
 from experiments.run.folder_lock import TRACES, locked
 from experiments.run.provenance import version_changes
 from experiments.run.store import ResultStore
@@ -36,8 +37,6 @@ CASE_LIMIT = 1800.0
 """Time limit of a case, s: the slowest agent, IPOPT's, takes some minutes on a busy computer."""
 TRACES_KEPT = ("all", "drawn", "none")
 """Traces that a run keeps: those of all cases, those that a report draws, none."""
-MOST_PATHS = 24
-"""Most paths of an agent and setting that a report draws."""
 MOST_FAILED = 200
 """Most failed cases that are printed."""
 

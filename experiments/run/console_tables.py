@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from experiments.run import ranking, regimes
+from experiments.run.excerpts import MOST_SETTINGS, of_paths
 from experiments.run.learning_cost import words
 from experiments.run.metrics import BANDS, PAPER_SIMULATION, published_row
 from experiments.run.tables import (
@@ -185,12 +186,18 @@ def all_tables(cases: Iterable[Result]) -> RenderableType:
     kept = ordered(current(cases))
     groups = cases_by_setting(kept)
     parts: list[RenderableType] = [*by_regime(kept)]
-    for setting, rows in by_setting(build_rows(kept)).items():
+    of_setting = by_setting(build_rows(kept))
+    for setting, every in list(of_setting.items())[:MOST_SETTINGS]:
+        rows, left_out = of_paths(every)
         title = _with_spreads(str(setting), any(row.trainings > 1 for row in rows))
         parts += [_tracking(title, rows), _effort(rows)]
+        if left_out:
+            parts += [Text(left_out, style="dim"), _key_figures("", groups[setting])]
         if (curvature := _curvature(groups[setting])) is not None:
             parts.append(curvature)
         parts.append(Text())
+    if len(of_setting) > MOST_SETTINGS:
+        parts.append(Text(f"{MOST_SETTINGS} of {len(of_setting)} settings are shown.", style="dim"))
     learning = [
         Text(f"trained: {label}: {training.get('algorithm', '?')}, {words(training)}")
         for label, training in trainings(kept)
