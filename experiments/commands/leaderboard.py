@@ -69,8 +69,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     write_atomically(options.out / "leaderboard.md", text.encode())
     refuted = [row for row in rows if found[row.key].refuted]
     for row in refuted:
-        words, remark, _ = found[row.key]
-        line = f"{row.label} in {row.store.folder}: {words}: {remark}"
+        mark = found[row.key]
+        line = f"{row.label} in {row.store.folder}: {mark.words}: {mark.remark}"
         console.print(line, markup=False, style="red")
     console.out(f"leaderboard: {options.out / 'index.html'}, {len(rows)} rows", highlight=False)
     return 1 if refuted else 0

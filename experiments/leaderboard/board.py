@@ -28,7 +28,7 @@ HEADINGS = (
     "agent", "place", "mean rank", "whole path", ("ALE", "m"), ("MLE", "m"), ("predict", "ms"),
     "drives", "trainings", "rerun here",
 )  # fmt: skip
-ORIGIN = ("agent", "revision", "versions", "processor", "system", "cost of training")
+ORIGIN = ("agent", "revision", "versions", "processor", "system", "cost of training", "other here")
 NUMERIC = range(1, 9)
 NOTES = (
     (
@@ -159,8 +159,10 @@ def cells(entry: Entry) -> list[Cell]:
 
 
 def origin(entry: Entry) -> list[Cell]:
-    """Return the columns of `ORIGIN`, as far as manifests have them."""
-    return [_agent(entry.row), *_provenance(entry.row.manifests), _cost(entry.row)]
+    """Return the columns of `ORIGIN`, as far as manifests have them; last what differs here."""
+    row = entry.row
+    other = shortened(entry.mark.differs, 2 * LONGEST)
+    return [_agent(row), *_provenance(row.manifests), _cost(row), other or "–"]
 
 
 def _agent(row: Row) -> tuple[str, str]:

@@ -25,6 +25,8 @@ class Mark(NamedTuple):
     remark: str = ""
     refuted: bool = False
     """True if a case does not reproduce: the row is not ranked."""
+    differs: str = ""
+    """Versions, sources and processor of the row where they are not those of this computer."""
 
 
 def sample(row: Row, number: int, seed: int) -> list[Result]:
@@ -113,8 +115,7 @@ def _mark(verdicts: Sequence[Verdict], not_run: Sequence[str]) -> Mark:
             Mark("– not rerun", next(iter([*notes, *not_run]), "")) if notes or not_run else Mark()
         )
     count = f"({len(compared)} of {len(verdicts) + len(not_run)})"
-    elsewhere = [origin_words(one.row) for one in compared if not one.exact]
-    remark = "; ".join([*elsewhere[:1], *filter(None, [left]), *notes[:1]])
-    if any(not one.exact and one.equal < one.values for one in compared):
-        return Mark(f"✓ within {reproduction.RELATIVE:g} {count}", remark)
-    return Mark(f"✓ bit for bit {count}", remark)
+    differs = next((origin_words(one.row) for one in compared if not one.exact), "")
+    inexact = any(not one.exact and one.equal < one.values for one in compared)
+    way = f"within {reproduction.RELATIVE:g}" if inexact else "bit for bit"
+    return Mark(f"✓ {way} {count}", "; ".join(filter(None, [left, *notes[:1]])), differs=differs)

@@ -150,7 +150,7 @@ def test_trainings_are_one_row_with_both_spreads(tmp_path: Path) -> None:
     assert shown[5] == "0.2750 | drives 0.2750 to 0.2750; trainings 0.1000 to 0.6000"
     assert shown[7] == "2 of 2"
     assert shown[8] == "3"
-    assert origin(entries[1])[-1] == "3.00 k steps, 3 min, 0 solves"
+    assert origin(entries[1])[-2] == "3.00 k steps, 3 min, 0 solves"
 
 
 def test_a_training_that_lacks_a_drive_makes_its_row_incomplete(tmp_path: Path) -> None:
