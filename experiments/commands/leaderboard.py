@@ -48,6 +48,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         console.print(f"left out: {line}", markup=False, style="red")
     if len(skipped) > MOST_LINES:
         console.print(f"left out: {len(skipped) - MOST_LINES} more lines", style="red")
+    options.out.mkdir(parents=True, exist_ok=True)
     found = {row.key: mark for row in rows if (mark := marks.altered(row))}
     sound = [row for row in rows if row.key not in found]
     samples = {row.key: marks.sample(row, options.sample, options.seed) for row in rows}
@@ -63,7 +64,6 @@ def run(options: argparse.Namespace, console: Console) -> int:
     made = [(section, board.entries_of(section, found, ids)) for section in sections]
     command = _command(options)
     page = board.page(made, options.title, f"made by {command}", skipped)
-    options.out.mkdir(parents=True, exist_ok=True)
     write_atomically(options.out / "index.html", page.encode())
     text = board.markdown(made, options.title, command, skipped)
     write_atomically(options.out / "leaderboard.md", text.encode())
