@@ -186,7 +186,7 @@ def drawn_paths(cases: Iterable[Result]) -> dict[Setting, set[str]]:
     for case in cases:
         found = errors.setdefault(family_of(case), {})
         path = str(case.get("trajectory"))
-        error = case["metrics"].get("mle", np.inf) if case.get("status") == "ok" else np.inf
+        error = case["metrics"].get("mle", np.inf) if case.get("end") == "finished" else np.inf
         found[path] = max(error, found.get(path, 0.0))
     return {family: set(first_and_worst(found)) for family, found in errors.items()}
 

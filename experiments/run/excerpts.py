@@ -3,6 +3,7 @@
 Folders that fit on a page are shown whole.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -16,11 +17,15 @@ MOST_SETTINGS = 200
 MOST_LISTED = 500
 """Most failed cases, warnings and the like that are listed."""
 
+WHOLE = re.compile(r"(\d+ )?finished")
+"""End of a row whose drives all reached the end of the path."""
+
 
 def first_and_worst(errors: Mapping[str, float]) -> list[str]:
     """Return at most `MOST_PATHS` paths in their order: half of them the first, half the worst.
 
-    `errors` gives the largest error of each path, inf where a drive failed.
+    `errors` gives the largest error of each path, inf where a drive did not reach
+    the end.
     """
     names = list(errors)
     if len(names) <= MOST_PATHS:
@@ -38,7 +43,8 @@ def of_paths(rows: Sequence[Row]) -> tuple[list[Row], str]:
     errors: dict[str, float] = {}
     for row in rows:
         if not row.published:
-            found = row.values["mle"].mean if "mle" in row.values else np.inf
+            whole = WHOLE.fullmatch(row.end) and "mle" in row.values
+            found = row.values["mle"].mean if whole else np.inf
             errors[row.trajectory] = max(found, errors.get(row.trajectory, 0.0))
     kept = set(first_and_worst(errors))
     if len(kept) == len(errors):
