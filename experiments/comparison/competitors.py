@@ -84,14 +84,12 @@ def read_folder(path: Path, measures: Sequence[Measure], skipped: list[str]) -> 
     ValueError
         If the folder does not exist or holds no results.
     """
-    cases = ResultStore(path).cases(skipped, _read) if path.is_dir() else []
-    if not cases:
-        raise ValueError(f"no results in {path}")
-    runs: dict[str, dict[str, dict[int | None, Run]]] = {name: {} for name in labels(cases)}
+    runs: dict[str, dict[str, dict[int | None, Run]]] = {}
+    one_each: dict[str, Result] = {}
     drives: dict[str, Drive] = {}
     titles: dict[Setting, str] = {}
     metrics: set[str] = set()
-    for case in cases:
+    for case in ResultStore(path).stream(skipped, _read) if path.is_dir() else ():
         metrics.update(case["metrics"])
         key = drive_of(case)
         if key not in drives:
@@ -104,8 +102,12 @@ def read_folder(path: Path, measures: Sequence[Measure], skipped: list[str]) -> 
             tuple(one.loss(case, passed=done) for one in measures), done,
             case["solver"].get("median"),
         )  # fmt: skip
-        runs[label_of(case)].setdefault(key, {})[training_of(case)] = run
-    found = {label: Competitor(path, label, own) for label, own in runs.items()}
+        label = label_of(case)
+        one_each.setdefault(label, case)
+        runs.setdefault(label, {}).setdefault(key, {})[training_of(case)] = run
+    if not runs:
+        raise ValueError(f"no results in {path}")
+    found = {label: Competitor(path, label, runs[label]) for label in labels(one_each.values())}
     return Folder(path, found, drives, frozenset(metrics))
 
 

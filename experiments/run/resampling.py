@@ -23,9 +23,9 @@ Statistic = Callable[..., Array]
 """Maps the draws of drives (resamples, drives), and for each competitor those of its trainings
 (resamples, trainings), to statistics (statistics, resamples)."""
 
-MOST_DRAWS = 50_000_000
+MOST_DRAWS = 20_000_000
 """Bound on drives times resamples; of many drives fewer resamples are drawn."""
-FEWEST = 500
+FEWEST = 1000
 """Fewest resamples of many drives."""
 AT_ONCE = 2_000_000
 """Draws of drives that are held at once: bounds memory."""
