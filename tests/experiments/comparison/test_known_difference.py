@@ -54,7 +54,6 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Compare:
     return of
 
 
-@pytest.mark.slow
 def test_intervals_cover_the_difference_of_ten_times_as_many_drives(
     compared: Compare, monkeypatch: pytest.MonkeyPatch
 ) -> None:
