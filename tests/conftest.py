@@ -15,6 +15,7 @@ SLOW = (
     "agents/nmpc/test_rti",
     "agents/test_agents", "agents/test_delay", "agents/test_sb3", "agents/learned",
     "agents/weight_tuning", "campaigns", "experiments/commands", "experiments/jobs",
+    "experiments/comparison/test_compare_command", "experiments/comparison/test_known_difference",
     "experiments/parallel",
     "experiments/report/test_report_browser", "experiments/ros", "experiments/run/test_computing",
     "experiments/run/test_engines", "experiments/run/test_learning_cost",

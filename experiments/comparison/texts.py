@@ -32,7 +32,6 @@ NOTE = (
     "rate and jerk are root mean squares. Definitions: Agarwal et al., NeurIPS 2021."
 )
 GAP_NOTE = "Optimality gap: 1 - mean(min(1, target / metric)); 0 is the best, a failed drive has 1."
-FEW_SEEDS = 10
 SHOWN = 3
 """Drives of one side alone that are named."""
 ESCAPED = {
@@ -155,15 +154,6 @@ def intervals(outcome: Outcome) -> str:
     return f"95 % intervals: bootstrap, {outcome.resamples:,} resamples, over {outcome.resampled}"
 
 
-def few_units(outcome: Outcome) -> str | None:
-    """Return a warning where intervals rest on few seeds or trainings."""
-    seeds = len({drive.seed for drive in outcome.drives})
-    least = min(n for n in (seeds, *outcome.trainings) if n > 1) if seeds > 1 else 0
-    if 1 < least < FEW_SEEDS:
-        return f"intervals over fewer than {FEW_SEEDS} seeds or trainings are somewhat too narrow"
-    return None
-
-
 def times(outcome: Outcome) -> str | None:
     """Return the median times of `predict` of both sides; None if they are not known."""
     if outcome.seconds_a is None or outcome.seconds_b is None:
@@ -206,7 +196,8 @@ def gaps(outcome: Outcome) -> Iterator[str]:
 def remarks(outcome: Outcome) -> list[str]:
     """Return the lines below a table."""
     lines = [failures(outcome), intervals(outcome)]
-    lines += [line for line in (few_units(outcome), times(outcome)) if line]
+    if line := times(outcome):
+        lines.append(line)
     fewer = Counter({one.measure.heading: one.drives for one in outcome.metrics})
     lines += [
         f"{name}: {_plural(count, 'drive')} that have it"
