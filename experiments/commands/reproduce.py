@@ -180,7 +180,11 @@ def summary(verdicts: Iterable["Verdict"]) -> str:
         values, equal = sum(one.values for one in group), sum(one.equal for one in group)
         way = "bit for bit"
         if not exact:
-            way = f"within {RELATIVE:g} of the value or {ABSOLUTE:g} ({equal} equal bit for bit)"
+            largest = max((one.largest for one in group), default=0.0)
+            way = (
+                f"within {RELATIVE:g} of the value or {ABSOLUTE:g} ({equal} equal bit for bit, "
+                f"largest relative difference {largest:.1g})"
+            )
         if group:
             parts.append(f"{_count(len(group), 'case')}, {_count(values, 'value')} {way}")
     different = [verdict for verdict in compared if verdict.differences]

@@ -118,7 +118,7 @@ def test_other_versions_are_compared_within_a_tolerance(folder: Path) -> None:
     assert code == 0
     assert rows["pid"][-1] == "✓ bit for bit (2 of 2)"
     assert (folder.parent / "board" / "leaderboard.md").read_text().count("numpy 1.0.0 there") == 2
-    assert rows["stanley"][-1] == "✓ within 0.0001 (2 of 2)"
+    assert rows["stanley"][-1] == "✓ within 0.001 (2 of 2)"
 
     def off(case: dict[str, Any]) -> None:
         case["metrics"]["ale"] *= 1.0 + 1e-3

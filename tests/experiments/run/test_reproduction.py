@@ -362,7 +362,8 @@ def test_fields_and_metrics_that_a_pasted_result_lacks(folder: Path, paste: Repr
     assert said.count(" there, ") == 1
     assert f"seed 1: metrics.ale {ale} there" in said
     assert "compared: 2 cases, 2 values within" in said
-    assert said.splitlines()[-1].endswith("(1 equal bit for bit): 1 difference in 1 case")
+    assert said.splitlines()[-1].endswith(": 1 difference in 1 case")
+    assert "(1 equal bit for bit, largest relative difference 0." in said
 
 
 def test_a_case_that_cannot_be_run_says_why(paste: Reproduce) -> None:
@@ -509,6 +510,7 @@ def test_values_are_compared_by_the_tolerance_or_by_their_bits(folder: Path) -> 
     assert not judged(row, near, exact=False).differences
     assert len(judged(row, near, exact=True).differences) == 1
     assert len(judged(row, far, exact=False).differences) == 1
+    assert judged(row, far, exact=False).largest == pytest.approx(1.1 * RELATIVE, rel=0.01)
     small = {**made, "metrics": {**metrics, "excess_speed": 0.9 * ABSOLUTE}}
     assert row.result["metrics"]["excess_speed"] == 0.0
     assert not judged(row, small, exact=False).differences
