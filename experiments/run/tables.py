@@ -289,7 +289,9 @@ def two_way(values: Iterable[tuple[Hashable, int | None, float]]) -> Estimate:
     for drive, training, value in values:
         drives.setdefault(drive, []).append(value)
         by_training.setdefault(training, []).append(value)
-    found = estimate([float(np.mean(group)) for group in drives.values()])
+    # Most drives have one value, and there may be a hundred thousand of them.
+    means = [one[0] if len(one) == 1 else float(np.mean(one)) for one in drives.values()]
+    found = estimate(means)
     if len(by_training) < 2:
         return found
     spread = estimate([float(np.mean(group)) for group in by_training.values()])

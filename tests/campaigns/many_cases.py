@@ -36,7 +36,7 @@ MEMORY = 2**30
 GROWTH = 12.0
 """Largest ratio of times with all cases and with a tenth of them."""
 TENTH = 1000
-"""Fewest cases of which a tenth is measured, too."""
+"""Fewest cases of which a tenth is measured, and that are driven in several processes."""
 
 
 class Cost(NamedTuple):
@@ -78,7 +78,12 @@ def driven(folder: Path, count: int) -> list[dict[str, Any]]:
     """Drive `count` cases and return their rows."""
     console = Console(file=io.StringIO())
     store = run_benchmark(
-        specs_of(count), folder, engine=Engine(), settings={}, console=console, traces="drawn"
+        specs_of(count),
+        folder,
+        engine=Engine(1 if count < TENTH else None),
+        settings={},
+        console=console,
+        traces="drawn",
     )
     return list(store.stream())
 
@@ -121,6 +126,8 @@ def measured(
         "compare": ["compare", str(first), str(second), "--out", str(folder / "compared")],
         "merge": ["merge", str(folder / "merged"), str(first)],
     }  # fmt: skip
+    if count < TENTH:
+        del commands["compare"]  # some ten seconds for any number of cases
     costs = {}
     for name, words in commands.items():
         cost = costs[name] = cost_of([sys.executable, "-m", "experiments", *words])
