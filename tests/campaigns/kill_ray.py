@@ -37,8 +37,8 @@ EARLY = 0.25
 """Share of the moments that lie before the first case."""
 WORDS = ["benchmark", "--agents", "stanley", "pid", "--trajectories", "u-turn", "T5"]
 PRINTED = r"^\[(\d+)/"
-LONG = ["benchmark", "--agents", "lpv-nmpc", "--trajectories", "T1", "T2", "T5"]
-"""Cases of some seconds."""
+LONG = ["benchmark", "--agents", "lpv-nmpc", "--trajectories", "T5", "T6"]
+"""Cases of a second and more: drives of four minutes."""
 
 
 def job(*words: str) -> Job:
@@ -182,7 +182,7 @@ def cases_per_second(words: list[str], folder: Path) -> float:
     return (len(times) - 5) / (times[-1] - times[4])
 
 
-def throughput(seeds: int = 20) -> int:
+def throughput(seeds: int = 30) -> int:
     """Print the cases per second of the local pool and of two nodes, twice each."""
     rates: dict[str, list[float]] = {"local": [], "ray": []}
     with tempfile.TemporaryDirectory() as scratch, cluster(2) as made:
