@@ -6,12 +6,9 @@ runs again elsewhere. Nothing is left on a cluster but Ray itself.
 """
 
 import contextlib
-import logging
 import math
-import os
 import pickle
 import secrets
-import socket
 import time
 import warnings
 from collections import Counter
@@ -22,6 +19,7 @@ from typing import Any
 
 from experiments.run import shipping
 from experiments.run.provenance import COMPUTING
+from experiments.run.ray_session import connected
 from experiments.run.ray_worker import CHILD_DIED, OTHER_ID, about, actor_class, packed
 from experiments.run.worker_process import (
     DIED,
@@ -35,19 +33,8 @@ from experiments.run.worker_process import (
     Run,
     Spec,
 )
-from trajectories.arguments import shortened, shown
+from trajectories.arguments import shortened
 
-QUIET = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    # All of what Ray prints about other processes, such as the log of a node that was lost.
-    "RAY_DEDUP_LOGS_SKIP_REGEX": ".",
-}
-"""Environment that keeps Ray's own messages off the screen, and GPUs visible."""
-LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
-"""Environment of a Ray that only this computer reaches."""
-STORE = 2**29
-"""Memory for objects of a local Ray, bytes; more goes to disk."""
 TURN = 1.0
 """Time between looks at the nodes, s."""
 MOST_LOSSES = 5
@@ -94,63 +81,6 @@ def run_on_ray(
                 yield from sweep.turn()
         finally:
             sweep.end()
-
-
-@contextlib.contextmanager
-def connected(workers: int | None, address: str | None) -> Iterator[None]:
-    """Connect to a cluster, or start a Ray on this computer; it ends with the context.
-
-    Where this process uses a Ray already, that one is used.
-    """
-    wanted = QUIET | LOOPBACK if address is None else QUIET
-    os.environ.update({key: value for key, value in wanted.items() if key not in os.environ})
-    try:
-        import ray
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "--engine ray needs ray: pip install 'lpv-track-env[ray]'"
-        ) from None
-    if ray.is_initialized():
-        yield
-        return
-    options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
-    if address is None:
-        options |= {
-            "address": "local", "num_cpus": workers or os.cpu_count() or 1,
-            "include_dashboard": False, "object_store_memory": STORE,
-        }  # fmt: skip
-    try:
-        if address is not None:
-            _reach(address)
-            options["address"] = address
-        ray.init(**options)
-    except (OSError, RuntimeError, ValueError) as error:
-        where = "on this computer" if address is None else f"at {shown(address)}"
-        raise ValueError(
-            f"no Ray {where} ({shortened(error, 120)}): on a cluster run ray start --head, and "
-            "this command on one of its computers, see docs/benchmark.md"
-        ) from None
-    try:
-        yield
-    finally:
-        ray.shutdown()
-
-
-def _reach(address: str) -> None:
-    """Check that something listens at an address, for which Ray itself would wait for minutes.
-
-    Raises
-    ------
-    OSError
-        If nothing does.
-    ValueError
-        If it is neither HOST:PORT nor "auto".
-    """
-    host, _, port = address.rpartition(":")
-    if address != "auto":
-        if not host or not port.isdecimal():
-            raise ValueError("give HOST:PORT, as ray start prints it, or auto")
-        socket.create_connection((host, int(port)), timeout=PATIENCE).close()
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ STORE = 80_000_000
 @contextmanager
 def cluster(nodes: int = 2) -> Iterator[Any]:
     """A Ray cluster of nodes with one CPU each on this computer."""
-    from experiments.run.ray_engine import LOOPBACK, QUIET
+    from experiments.run.ray_session import LOOPBACK, QUIET
 
     os.environ.update(QUIET | LOOPBACK)
     from ray.cluster_utils import Cluster
