@@ -129,7 +129,7 @@ def specs_of(
 
 def summary(cases: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return means over the episodes of a cell with 95 % intervals, and how many finished."""
-    from experiments.run.tables import estimate
+    from experiments.run.estimates import estimate
 
     values: dict[str, Any] = {}
     for key in ("mle", "ale", "rms_estimate_error", "steering_variation"):

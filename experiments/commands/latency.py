@@ -213,7 +213,7 @@ def read_times(file: Path) -> dict[str, list[float]]:
 
 def summary(cases: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return latencies (s), share of missed periods and errors over the episodes of a cell."""
-    from experiments.run.tables import estimate
+    from experiments.run.estimates import estimate
 
     ale, mle = (estimate([case["metrics"][key] for case in cases]) for key in ("ale", "mle"))
     periods = [case["metrics"]["duration"] / case["control_period"] for case in cases]

@@ -20,6 +20,7 @@ from experiments.report.page import (
 from experiments.report.svg_charts import BOTTOM, TOP, Chart, Scale, decades
 from experiments.run import tables
 from experiments.run.console_tables import BAND_NOTE, Line, band_lines, band_ranges
+from experiments.run.estimates import Estimate
 from experiments.run.excerpts import of_paths
 from experiments.run.metrics import BANDS, published_row
 from experiments.run.tables import (
@@ -28,7 +29,6 @@ from experiments.run.tables import (
     SPREADS,
     TRACKING,
     Column,
-    Estimate,
     Result,
     Row,
     Setting,

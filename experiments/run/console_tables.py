@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from experiments.run import ranking, regimes
+from experiments.run.estimates import Estimate, two_way
 from experiments.run.excerpts import MOST_SETTINGS, of_paths
 from experiments.run.learning_cost import words
 from experiments.run.metrics import BANDS, PAPER_SIMULATION, published_row
@@ -20,7 +21,6 @@ from experiments.run.tables import (
     SPREADS,
     TRACKING,
     TRAININGS_NOTE,
-    Estimate,
     Result,
     Row,
     build_rows,
@@ -35,7 +35,6 @@ from experiments.run.tables import (
     training_of,
     trainings,
     trainings_of,
-    two_way,
     violated,
     with_trainings,
 )

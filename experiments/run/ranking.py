@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from experiments.run import regimes
+from experiments.run.estimates import range_words
 from experiments.run.statistics import CONFIDENCE, RESAMPLES, rate_interval
 from experiments.run.tables import (
     Result,
     by_label,
     drive_of,
-    range_words,
     training_of,
     with_trainings,
 )

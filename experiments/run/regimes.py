@@ -13,17 +13,16 @@ from rich.text import Text
 
 from agents.weight_tuning.score import SCALES
 from experiments.run import physical_limits
+from experiments.run.estimates import Estimate, two_way
 from experiments.run.search import passes
 from experiments.run.statistics import rate_interval
 from experiments.run.tables import (
-    Estimate,
     Result,
     by_label,
     ordered,
     training_of,
     training_range,
     trainings_of,
-    two_way,
     with_trainings,
 )
 

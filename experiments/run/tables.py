@@ -8,24 +8,21 @@ mean and its 95 % interval by the t-distribution.
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import t as student
 
 import agents
 import trajectories
 from experiments.run import suites
 from experiments.run.case import Case
+from experiments.run.estimates import Estimate, range_words, two_way
 from experiments.run.learning_cost import average, words
 from experiments.run.metrics import KEPT, PAPER_COLUMNS, published_row
-from experiments.run.statistics import CONFIDENCE
 from experiments.run.training_folders import trained
 
 Result = Mapping[str, Any]
@@ -176,30 +173,6 @@ def conditions_words(given: str | Mapping[str, Any]) -> str:
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """Mean over runs, and half widths of its 95 % intervals.
-
-    `half_width` is that over evaluation seeds, `over_trainings` that over the trainings of an
-    agent; each is None where there are not several.
-    """
-
-    mean: float
-    half_width: float | None = None
-    over_trainings: float | None = None
-
-    def words(self, decimals: int, separator: str = " ", factor: float = 1.0) -> str:
-        """Write `factor` times the mean and half widths, ± each after `separator`.
-
-        The second ± is that over trainings; where there is one evaluation seed the first is "±–".
-        """
-        widths = [self.half_width, self.over_trainings]
-        while widths and widths[-1] is None:
-            widths.pop()
-        ends = ["–" if width is None else f"{factor * width:.{decimals}f}" for width in widths]
-        return separator.join([f"{factor * self.mean:.{decimals}f}", *(f"±{end}" for end in ends)])
-
-
-@dataclass(frozen=True)
 class Column:
     """Numeric column: key in `Row.values`, heading, unit, decimals, factor on stored values."""
 
@@ -268,36 +241,6 @@ class Row:
         return with_trainings(self.label, self.trainings)
 
 
-def estimate(values: Sequence[float]) -> Estimate:
-    """Return the mean of values; for two or more its interval, t_(0.975, n - 1) s / sqrt(n)."""
-    mean = float(np.mean(values))
-    n = len(values)
-    if n < 2:
-        return Estimate(mean)
-    quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, n - 1))
-    return Estimate(mean, quantile * float(np.std(values, ddof=1)) / n**0.5)
-
-
-def two_way(values: Iterable[tuple[Hashable, int | None, float]]) -> Estimate:
-    """Return the mean of values that belong to a drive and a training, with both intervals.
-
-    Values of one drive, such as an evaluation seed, are averaged, and the mean of these means has
-    its interval over drives; values of one training are averaged likewise, if there are several.
-    """
-    drives: dict[Hashable, list[float]] = {}
-    by_training: dict[int | None, list[float]] = {}
-    for drive, training, value in values:
-        drives.setdefault(drive, []).append(value)
-        by_training.setdefault(training, []).append(value)
-    # Most drives have one value, and there may be a hundred thousand of them.
-    means = [one[0] if len(one) == 1 else float(np.mean(one)) for one in drives.values()]
-    found = estimate(means)
-    if len(by_training) < 2:
-        return found
-    spread = estimate([float(np.mean(group)) for group in by_training.values()])
-    return replace(found, over_trainings=spread.half_width)
-
-
 def path_name(trajectory: object) -> str:
     """Return the name of a trajectory; of a file, the name without its folder."""
     return Path(str(trajectory)).name
@@ -362,11 +305,6 @@ def training_range(cases: Iterable[Result], failed: Callable[[Result], bool]) ->
     if len(groups) < 2:
         return ""
     return range_words([100.0 * sum(group) / len(group) for group in groups.values()])
-
-
-def range_words(rates: Sequence[float] | NDArray[np.float64]) -> str:
-    """Write the least and the largest of the trainings' rates, %."""
-    return f"{min(rates):.0f}–{max(rates):.0f} % by training"
 
 
 def labels(cases: Iterable[Result]) -> list[str]:

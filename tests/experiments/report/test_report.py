@@ -11,6 +11,7 @@ from experiments.report.build import ERRATA, write_report
 from experiments.report.drives import reference_path, usable
 from experiments.report.page import line_styles
 from experiments.run import tables
+from experiments.run.estimates import Estimate, estimate
 from experiments.run.metrics import published_row
 from experiments.run.store import ResultStore
 from lpv_track_env import vehicle
@@ -31,11 +32,11 @@ from trajectories import load
 
 def test_mean_and_interval_by_hand():
     # Mean 2, s = 1, t_(0.975, 2) = 4.302653: 4.302653 / sqrt(3).
-    found = tables.estimate([1.0, 2.0, 3.0])
+    found = estimate([1.0, 2.0, 3.0])
     assert found.mean == 2.0
     assert found.half_width == pytest.approx(4.302652730 / math.sqrt(3.0), rel=1e-8)
-    assert tables.estimate([0.7]) == tables.Estimate(0.7, None)
-    assert tables.estimate([0.5, 0.5]).half_width == 0.0
+    assert estimate([0.7]) == Estimate(0.7, None)
+    assert estimate([0.5, 0.5]).half_width == 0.0
 
 
 def test_the_published_row_comes_first_and_seeds_are_one_row():
