@@ -14,18 +14,18 @@ STORE = 80_000_000
 
 
 @contextmanager
-def cluster(nodes: int = 2) -> Iterator[Any]:
-    """A Ray cluster of nodes with one CPU each on this computer."""
+def cluster(nodes: int = 2, **more: str) -> Iterator[Any]:
+    """A Ray cluster of nodes with one CPU each; `more` are environment variables of the nodes."""
     from experiments.run.ray_session import LOOPBACK, QUIET
 
     os.environ.update(QUIET | LOOPBACK)
     from ray.cluster_utils import Cluster
 
     head = {"include_dashboard": False, "include_log_monitor": False}
-    made = Cluster(initialize_head=True, head_node_args={**head, **node(1)})
+    made = Cluster(initialize_head=True, head_node_args={**head, **node(1, **more)})
     try:
         for _ in range(nodes - 1):
-            made.add_node(**node(1))
+            made.add_node(**node(1, **more))
         yield made
     finally:
         made.shutdown()
@@ -80,9 +80,10 @@ def children_at_work(pid: int) -> list[int]:
 
 
 def note(spec: Spec) -> dict[str, Any]:
-    """Say which processes ran the spec."""
+    """Say which processes ran the spec, and in which folder."""
     time.sleep(spec.get("lasts", 0.0))
-    return {"seed": spec["seed"], "status": "ok", "pid": os.getpid(), "actor": os.getppid()}
+    processes = {"pid": os.getpid(), "actor": os.getppid()}
+    return {"seed": spec["seed"], "status": "ok", "where": str(Path.cwd()), **processes}
 
 
 def failed(spec: Spec, error: str) -> dict[str, Any]:

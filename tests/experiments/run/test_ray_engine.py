@@ -3,7 +3,6 @@
 import importlib.util
 import shutil
 import sys
-import tempfile
 import time
 import warnings
 from collections.abc import Iterator
@@ -32,8 +31,14 @@ ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Any]:
-    with ray_runs.cluster() as made:
+def temporary(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the nodes' temporary files."""
+    return tmp_path_factory.mktemp("nodes")
+
+
+@pytest.fixture(scope="module")
+def cluster(temporary: Path) -> Iterator[Any]:
+    with ray_runs.cluster(TMPDIR=str(temporary)) as made:
         yield made
 
 
@@ -54,7 +59,7 @@ def seeds(results: list[dict[str, Any]]) -> list[int]:
     return sorted(result["seed"] for result in results)
 
 
-def test_specs_run_on_all_nodes_and_nothing_is_left(engine: Engine) -> None:
+def test_specs_run_on_all_nodes_and_nothing_is_left(engine: Engine, temporary: Path) -> None:
     specs, begun = [{"seed": seed, "lasts": 0.1} for seed in range(12)], []
     results = list(engine.run(specs, note, failed=failed, started=begun.append))
     assert seeds(results) == list(range(12))
@@ -64,7 +69,9 @@ def test_specs_run_on_all_nodes_and_nothing_is_left(engine: Engine) -> None:
     assert len({result["actor"] for result in results}) == 2
     assert not connected()
     assert not [result for result in results if runs(result["pid"])]
-    assert not list(Path(tempfile.gettempdir()).glob(f"{ray_worker.LEFT_BY}*/level"))
+    places = {Path(result["where"]) for result in results}
+    assert all(place.is_relative_to(temporary) and not place.exists() for place in places)
+    assert not list(temporary.glob(f"{ray_worker.LEFT_BY}*/level"))
 
 
 def test_specs_that_misbehave_end_as_in_the_local_pool(engine: Engine, tmp_path: Path) -> None:
