@@ -86,8 +86,11 @@ class Campaign:
             self.faults.append("whole sweeps differ")
         return lasted, facts["local"]
 
-    def strike(self, number: int, way: str, share: float, early: bool, resumed: Job) -> None:
-        """Disturb a sweep after a share of the time to its first case, or from there to its end."""
+    def strike(self, number: int, way: str, share: float, early: bool, resumed: Job) -> bool:
+        """Disturb a sweep after a share of the time to its first case, or from there to its end.
+
+        Return whether it was still running.
+        """
         folder = self.scratch / f"{way}-{number}"
         running = Running(self.ray, folder)
         running.wait_for_a_file()
@@ -97,7 +100,11 @@ class Campaign:
         label = f"{folder.name}, {wait:.2f} s after its {'start' if early else 'first case'}"
         running.process.join(wait)
         if not running.process.is_alive():
+            # The whole sweep was slower, for example because the machine was busy.
+            self.lasted = self.lasted[0], min(self.lasted[1], wait)
             self.seen["ended before"] += 1
+            shutil.rmtree(folder)
+            return False
         held = cases_held(folder)
         code = 0
         if way == "node":
@@ -108,11 +115,8 @@ class Campaign:
             sent, code = (
                 (signal.SIGKILL, -signal.SIGKILL) if way == "driver" else (signal.SIGINT, 130)
             )
-            if running.process.is_alive():
-                os.kill(running.process.pid, sent)
-                ended = running.end()
-            else:
-                ended, code = running.end(), 0
+            os.kill(running.process.pid, sent)
+            ended = running.end()
             self._check_stored(label, running, folder)
             self._check_gone(label)
         text = running.output.read_text()
@@ -132,6 +136,7 @@ class Campaign:
         self.seen[way] += 1
         self.seen["cases held"] += held
         shutil.rmtree(folder)
+        return True
 
     def _another_node(self) -> Any:
         self.cluster.worker_nodes.discard(self.added)
@@ -163,12 +168,13 @@ def run(count: int, seed: int, say: Say) -> Counts:
     seeds = 10 if count > len(WAYS) else 4
     with tempfile.TemporaryDirectory() as scratch, cluster(1) as made:
         campaign = Campaign(Path(scratch), made, seeds, say)
-        for number in range(count):
-            way = WAYS[number % len(WAYS)]
+        done = number = 0
+        while done < count:
+            way, number = WAYS[done % len(WAYS)], number + 1
             resumed = campaign.ray if rng.random() < 0.5 else campaign.local
             early = rng.random() < EARLY
-            campaign.strike(number, way, rng.random(), early, resumed)
-            say(f"{number + 1} of {count}, {way}, {len(campaign.faults)} broke")
+            done += campaign.strike(number, way, rng.random(), early, resumed)
+            say(f"{done} of {count}, {way}, {len(campaign.faults)} broke")
     return Counts(count, campaign.faults, dict(campaign.seen))
 
 
