@@ -7,7 +7,6 @@ of the cases and with all. What takes more than `MEMORY`, or far longer than in 
 
 import io
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -30,6 +29,13 @@ PATHS = (
     "u-turn", "sine", "double-lane-change", "circle", "straight", "figure-eight",
     "iso-3888-1-1.8", "iso-3888-2-1.8", "random-0", "random-1",
 )  # fmt: skip
+LAUNCH = """
+import resource, subprocess, sys
+done = subprocess.run(sys.argv[1:], stdout=sys.stderr)
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+sys.exit(done.returncode not in (0, 1))
+"""
+"""A small process between: the system counts the memory of a process that starts another to it."""
 DRIVEN = 2000
 MEMORY = 2**30
 """Most memory that a command may take, bytes."""
@@ -104,7 +110,8 @@ def write(folder: Path, rows: Sequence[dict[str, Any]], count: int, seed: int | 
                 row["metrics"] = {**row["metrics"], "ale": row["metrics"]["ale"] * rng.uniform()}
             yield json.dumps(row, sort_keys=True).encode() + b"\n"
 
-    ResultStore(folder).cases_file.write_bytes(b"".join(lines()))
+    with ResultStore(folder).cases_file.open("wb") as handle:
+        handle.writelines(lines())
 
 
 def measured(
@@ -144,13 +151,12 @@ def cost_of(words: Sequence[str]) -> Cost:
         If it fails.
     """
     began = time.perf_counter()
-    with tempfile.TemporaryFile() as output:
-        process = subprocess.Popen(words, stdout=output, stderr=output)
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode not in (0, 1):
-            output.seek(0)
-            raise RuntimeError(output.read()[-2000:].decode())
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", LAUNCH, *words], capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise RuntimeError(done.stderr[-2000:])
     # Linux counts in KiB, macOS in bytes.
     unit = 1 if sys.platform == "darwin" else 1024
-    return Cost(time.perf_counter() - began, usage.ru_maxrss * unit)
+    return Cost(time.perf_counter() - began, int(done.stdout) * unit)
