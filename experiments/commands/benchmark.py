@@ -16,7 +16,7 @@ EXAMPLE = "lpv-track benchmark --agents stanley lqr --trajectories T1 T2 --out r
 MOST_WARNINGS = 10
 """Different warnings of the drives that are printed."""
 MOST_COMPARED = 500
-"""Different warnings that are looked through for repetitions."""
+"""Different warnings among which repetitions are looked for."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -58,12 +58,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--traces", choices=("all", "drawn", "none"), default="all",
-        help="traces/ID.npz of all cases (default), of those that a report draws, or none",
+        help="keep traces/ID.npz of all cases (default), of those that a report draws, or of none",
     )  # fmt: skip
     parser.add_argument(
         "--shard", type=_shard, metavar="I/N",
-        help="only every N-th case from the I-th on, for batch systems; each shard has an --out of "
-        "its own, and lpv-track merge joins them",
+        help="run only every N-th case from the I-th on, for batch systems; each shard has its own "
+        "--out, and lpv-track merge joins them",
     )  # fmt: skip
     parser.add_argument(
         "--resume", action="store_true", help="keep the cases that DIR holds already"

@@ -18,8 +18,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument(
         "folders", nargs="+", type=shared.file_name, metavar="DIR",
-        help="folders of results: agents of the others meet their namesakes in the first; or one, "
-        "whose agents meet its baseline",
+        help="folders of results: agents are compared with those of the same name in the first; in "
+        "one folder, with its baseline",
     )  # fmt: skip
     shared.add_agents(parser, "agents to compare, as the tables call them (default: all)")
     parser.add_argument(
@@ -34,7 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--target", nargs="+", default=[], metavar="METRIC=VALUE",
-        help="give optimality gaps: the mean shortfall from a target, e.g. ale=0.05",
+        help="print optimality gaps: the mean shortfall from a target, e.g. ale=0.05",
     )  # fmt: skip
     parser.add_argument("--latex", action="store_true", help="print the table in LaTeX")
     parser.add_argument(
@@ -50,7 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Compare, print the table, write table, numbers and figures; return 0, with --exact 0 or 1."""
+    """Print the comparison, write table, numbers and figures; return 0, with --exact 0 or 1."""
     if options.exact:
         return exactly(options, console)
     from experiments.comparison.texts import latex, terminal
@@ -63,9 +63,11 @@ def run(options: argparse.Namespace, console: Console) -> int:
     else:
         console.print(terminal(outcomes))
     written = write(outcomes, options.out, options.width)
+    # LaTeX is printed alone.
+    told = Console(stderr=True) if options.latex else console
+    for line in skipped:
+        told.print(f"left out: {line}", markup=False, style="red")
     if not options.latex:
-        for line in skipped:
-            console.print(f"left out: {line}", markup=False, style="red")
         console.out(f"in {options.out}: {', '.join(written)}", highlight=False)
     return 0
 

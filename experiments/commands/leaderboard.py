@@ -10,7 +10,7 @@ from experiments.commands import options as shared
 EXAMPLE = "lpv-track leaderboard results/benchmark results/limits --out build/leaderboard"
 SAMPLE = 5
 MOST_LINES = 10
-"""Most lines about what cannot be read."""
+"""Most lines that are printed on what cannot be read."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -73,7 +73,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         line = f"{row.label} in {row.store.folder}: {mark.words}: {mark.remark}"
         console.print(line, markup=False, style="red")
     console.out(f"leaderboard: {options.out / 'index.html'}, {len(rows)} rows", highlight=False)
-    return 1 if refuted else 0
+    return shared.EXIT_FAILED if refuted else 0
 
 
 def _command(options: argparse.Namespace) -> str:

@@ -97,7 +97,7 @@ def add_job(parser: argparse.ArgumentParser, folder: str) -> None:
     seeds.add_argument("--seed", type=whole(0, 999), default=0, help="0 to 999 (default 0)")
     seeds.add_argument(
         "--seeds", type=whole(0, 999), nargs="+", metavar="SEED",
-        help="one for each of these seeds, side by side, in DIR/seed-SEED",
+        help="run once for each of these seeds, side by side, in DIR/seed-SEED",
     )  # fmt: skip
     add_engine(parser)
     parser.add_argument("--vehicle", metavar="NAME", help="preset or .json (default m2-minibus)")
@@ -137,7 +137,8 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--address", metavar="ADDRESS",
-        help="of the Ray cluster, e.g. 10.0.0.1:6379 or auto (default: one on this computer)",
+        help="address of the Ray cluster, e.g. 10.0.0.1:6379 or auto (default: a Ray on this "
+        "computer)",
     )  # fmt: skip
 
 
@@ -147,13 +148,13 @@ def engine_of(options: argparse.Namespace) -> Engine:
     Raises
     ------
     ValueError
-        For an address without the engine that it belongs to.
+        For an address without `--engine ray`.
     """
     return Engine(options.workers, options.engine, options.address)
 
 
 def seeds_of_jobs(options: argparse.Namespace) -> list[int] | None:
-    """Return the seeds of `--seeds` of a training or tuning; None for a single one.
+    """Return the seeds of `--seeds` of a training or tuning; None if it was not given.
 
     Raises
     ------
@@ -163,7 +164,7 @@ def seeds_of_jobs(options: argparse.Namespace) -> list[int] | None:
     engine = engine_of(options)
     if options.seeds is None:
         if engine != Engine():
-            raise ValueError("--workers, --engine and --address are for several: give --seeds")
+            raise ValueError("--workers, --engine, --address are for several seeds: give --seeds")
         return None
     if len(set(options.seeds)) < len(options.seeds):
         raise ValueError(f"--seeds names a seed twice: {' '.join(map(str, options.seeds))}")
@@ -343,7 +344,7 @@ def agent_settings(
     """Return the settings of each agent from `--agent-set`.
 
     KEY=VALUE sets every agent, NAME:KEY=VALUE the agent NAME alone, whatever the former says.
-    `of_folders` has an agent for each name that is a folder of trainings.
+    `of_folders` gives the agent of each name that is a folder of trainings.
 
     Raises
     ------

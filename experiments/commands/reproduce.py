@@ -27,12 +27,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "folder", type=shared.file_name, metavar="DIR",
         help="folder of results; - reads results as JSON from standard input",
     )  # fmt: skip
-    parser.add_argument("--id", nargs="+", metavar="ID", help="these cases only")
+    parser.add_argument("--id", nargs="+", metavar="ID", help="run only these cases")
     parser.add_argument(
-        "--sample", type=shared.whole(1, 10**9), metavar="N", help="N cases, drawn at random"
+        "--sample", type=shared.whole(1, 10**9), metavar="N", help="run N cases, drawn at random"
     )
     parser.add_argument(
-        "--seed", type=shared.whole(0, 2**63 - 1), default=0, help="of the sample (default 0)"
+        "--seed", type=shared.whole(0, 2**63 - 1), default=0, help="seed of the sample (default 0)"
     )
     parser.add_argument(
         "--exact", action="store_true",
@@ -50,7 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the cases, print each difference; return 1 for one or for a damaged row, else 0."""
+    """Run the cases and print what differs; return 1 for a difference or a damaged row, else 0."""
     from experiments.run.reproduction import prepared, sampled
 
     results, manifest_of, torn, damaged = _results(options, console)
@@ -79,13 +79,13 @@ def run(options: argparse.Namespace, console: Console) -> int:
         raise
     _print(console, summary(verdicts))
     different = any(verdict.differences for verdict in verdicts)
-    return 1 if different or damaged or rows.damaged else 0
+    return shared.EXIT_FAILED if different or damaged or rows.damaged else 0
 
 
 def _results(
     options: argparse.Namespace, console: Console
 ) -> tuple[list[Any], Any, list[str], list[str]]:
-    """Return the wanted results, the reader of their manifests, a torn line, damaged lines."""
+    """Return the chosen results, the reader of their manifests, a torn line, damaged lines."""
     from experiments.run.reproduction import pasted, torn_line
     from experiments.run.store import ResultStore
     from trajectories.fileio import MOST_BYTES

@@ -30,6 +30,8 @@ from experiments.commands.options import (
 from experiments.training import ALGORITHMS
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from experiments.training.settings import TrainingSettings
 
 EXAMPLE = "lpv-track train ppo --seed 0 --hours 0.1 --out results/ppo"
@@ -207,8 +209,7 @@ def run_several(options: argparse.Namespace, seeds: Sequence[int], console: Cons
         settings = settings_of(own)
         return settings, command_line(settings, own)
 
-    def display(settings: Any, *given: Any) -> TrainingDisplay:
-        console, progress, prefix = given
+    def display(settings: Any, progress: "Progress", prefix: str) -> TrainingDisplay:
         return TrainingDisplay(console, settings.algorithm, settings.steps, progress, prefix)
 
     def finished(settings: Any, folder: Path) -> bool:

@@ -25,6 +25,8 @@ from experiments.commands.options import (
 from experiments.tuning import METHODS
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from experiments.tuning.settings import TuningSettings
 
 EXAMPLE = "lpv-track tune --method rl --seed 0 --out results/tune/rl"
@@ -172,8 +174,7 @@ def run_several(options: argparse.Namespace, seeds: Sequence[int], console: Cons
         settings = settings_of(own)
         return settings, command_line(settings, own)
 
-    def display(settings: Any, *given: Any) -> TuningDisplay:
-        console, progress, prefix = given
+    def display(settings: Any, progress: "Progress", prefix: str) -> TuningDisplay:
         return TuningDisplay(console, settings.method, settings.solves, progress, prefix)
 
     def finished(_settings: Any, folder: Path) -> bool:

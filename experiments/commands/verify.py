@@ -143,16 +143,12 @@ def _measure(
     specs: Sequence[dict[str, Any]], workers: int, console: Console
 ) -> list[dict[str, Any]]:
     """Measure the situations in this process or in a pool, and return results as they end."""
-    from experiments.run import engines
     from experiments.run.benchmark import progress_bar
+    from experiments.run.engines import Engine
     from experiments.verify.bench import run_situation, situation_death
 
-    workers = min(workers, len(specs))
-    running = (
-        engines.in_process(specs, run_situation)
-        if workers == 1
-        else engines.local_pool(specs, workers, run_situation, failed=situation_death)
-    )
+    engine = Engine(min(workers, len(specs)))
+    running = engine.run(specs, run_situation, failed=situation_death)
     results = []
     with progress_bar(console) as progress:
         bar = progress.add_task("situations", total=len(specs))

@@ -100,7 +100,7 @@ def _profile(panel: "Axes", outcomes: Sequence[Outcome], key: str) -> None:
     panel.set_ylim(-0.02, 1.02)
     if not len(levels):
         return
-    # Of a metric of which more is better, the axis runs to what is worse, too.
+    # The axis runs towards worse values also where more is better.
     end = float(levels.max())
     for place, (name, one, shares) in enumerate(curves.values()):
         x = measure.sign * np.append(one.profile.levels, end)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from experiments.comparison.competitors import Competitor, Drive
 from experiments.comparison.measures import Measure
-from experiments.run.resampling import Estimates, estimates, plan_of
+from experiments.run.resampling import Intervals, bootstrap_intervals, plan_of, run_weights
 from experiments.run.statistics import (
     Interval,
     optimality_gap,
@@ -27,7 +27,7 @@ LEVELS = 40
 SPAN = 1e3
 """Largest ratio of a profile's levels; less than the least of them is next to nothing."""
 HEAD = 6
-"""Number of statistics that every metric has."""
+"""Number of statistics that every metric has, see `_Sides.statistic`."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Profile:
 
 @dataclass(frozen=True)
 class Metric:
-    """What is found of one metric: differences are B - A, in the metric's unit.
+    """Results of one metric: differences are B - A, in the metric's unit.
 
     Means, `difference` and `relative` (to the size of A's mean) are over pairs that both passed;
     all else is over all drives, a failed one being behind every other.
@@ -135,7 +135,7 @@ class _Sides:
         """Return the statistics of draws: `HEAD` rows, gaps, both profiles."""
         if not self.known.all():
             drives = drives[:, self.known]
-        runs_a, runs_b = _runs(for_a, drives), _runs(for_b, drives)
+        runs_a, runs_b = run_weights(drives, for_a), run_weights(drives, for_b)
         flat_a, flat_b = self.a.ravel(), self.b.ravel()
         difference, mean = self._difference(drives, for_a, for_b)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -172,12 +172,6 @@ class _Sides:
         total_b = (drives * (for_b @ sum_b) * count_a).sum(axis=1)
         with np.errstate(invalid="ignore"):
             return (total_b - total_a) / pairs, total_a / pairs
-
-
-def _runs(trainings: Array, drives: Array) -> Array:
-    """Return how often each run is drawn, (resamples, trainings x drives)."""
-    runs: Array = (trainings[:, :, None] * drives[:, None, :]).reshape(len(drives), -1)
-    return runs
 
 
 def compare(
@@ -228,12 +222,12 @@ def compare(
         return np.concatenate([one.statistic(drawn, for_a, for_b) for one in sides])
 
     several = max(sizes) > 1
-    found = estimates(statistic, plan, sizes, seed=seed)
+    found = bootstrap_intervals(statistic, plan, sizes, seed=seed)
     apart = [found, found]
     if several:
         apart = [
-            estimates(statistic, plan, sizes, draw_trainings=False, seed=seed),
-            estimates(statistic, plan, sizes, draw_drives=False, seed=seed),
+            bootstrap_intervals(statistic, plan, sizes, draw_trainings=False, seed=seed),
+            bootstrap_intervals(statistic, plan, sizes, draw_drives=False, seed=seed),
         ]
     metrics, start = [], 0
     for side in sides:
@@ -243,7 +237,7 @@ def compare(
         np.array([[one.runs[key][training].passed for key in keys] for training in found])
         for one, found in zip((a, b), trainings, strict=True)
     )
-    # Of every pair of trainings, drive by drive.
+    # Counted over every pair of trainings, drive by drive.
     a_alone = int(((~passed_a).sum(axis=0) * passed_b.sum(axis=0)).sum())
     b_alone = int((passed_a.sum(axis=0) * (~passed_b).sum(axis=0)).sum())
     return Outcome(
@@ -314,11 +308,11 @@ def _levels(*losses: Array) -> Array:
     return spaced
 
 
-def _metric(side: _Sides, found: Estimates, apart: Sequence[Estimates], start: int) -> Metric:
+def _metric(side: _Sides, found: Intervals, apart: Sequence[Intervals], start: int) -> Metric:
     """Return a metric's results, whose statistics begin at `start`."""
     measure, count = side.measure, len(side.levels)
 
-    def interval(row: int, given: Estimates = found, *, turned: bool = False) -> Interval:
+    def interval(row: int, given: Intervals = found, *, turned: bool = False) -> Interval:
         """Return a statistic with its interval, `turned` if it is that of a negated metric."""
         ends = given.low[start + row], given.high[start + row]
         value = float(given.value[start + row])

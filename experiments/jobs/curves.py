@@ -47,7 +47,7 @@ TUNING = (Curve("score of the candidates", lambda line: line["score"]),)
 
 
 def draw(runs: Runs, curves: Sequence[Curve], budget: str, file: Path) -> None:
-    """Draw a curve a panel: each training thin, and of several their median thick.
+    """Draw each curve in a panel: every training thin and, of several, their median thick.
 
     `budget` is the entry of a line that the curves are drawn over, "steps" or "solves". A training
     without a figure counts as the worst in the median.
@@ -85,7 +85,7 @@ def _draw_curve(axes: "Axes", runs: Runs, curve: Curve, budget: str) -> None:
     for seed, lines in runs.items():
         colour, width = (COLOURS[5], 0.9) if several else (COLOURS[0], 1.5)
         axes.plot(over[seed], own[seed], color=colour, linewidth=width, marker=".", markersize=4)
-        # Of trainings alone: every step of a tuning may be better than the one before.
+        # In trainings alone: every step of a tuning may be better than the one before.
         kept = [k for k, line in enumerate(lines) if line.get("best") is True][-1:]
         label = "kept" if seed == next(iter(runs)) else None
         if kept:

@@ -1,4 +1,4 @@
-"""Jobs that differ in their seed, side by side: that of seed N in `FOLDER/seed-N`."""
+"""Jobs that differ in their seed, side by side; the job of seed N has the folder `seed-N`."""
 
 import argparse
 import contextlib
@@ -47,16 +47,16 @@ class Kind:
     run
         Runs or resumes a job: settings, folder, listener and `command`.
     display
-        Makes the display of a job from its settings, a console, a progress and a prefix.
+        Makes the display of a job from its settings, a progress bar and a prefix of its lines.
     finished
-        Tells from settings and folder whether nothing is left of a job.
+        Returns whether the job of given settings in a folder is finished.
     curves, budget
-        What `curves.draw` draws.
+        Arguments of `curves.draw`.
     """
 
     name: str
     run: Callable[..., Sequence[Line]]
-    display: Callable[[Any, Console, Progress, str], Display]
+    display: Callable[[Any, Progress, str], Display]
     finished: Callable[[Any, Path], bool]
     curves: Sequence[Curve]
     budget: str
@@ -143,7 +143,7 @@ def _unfinished(
 
 def _run(kind: Kind, specs: Sequence[Spec], engine: Engine, console: Console) -> int:
     failed = 0
-    with progress_bar(console) as progress, _followed(kind, specs, console, progress):
+    with progress_bar(console) as progress, _followed(kind, specs, progress):
         results = engine.run(
             specs, partial(_attempt, kind.run), failed=_outcome, files=_files, folder=_folder
         )
@@ -188,22 +188,19 @@ def _lines(folder: Path) -> list[Line]:
 
 
 @contextlib.contextmanager
-def _followed(
-    kind: Kind, specs: Sequence[Spec], console: Console, progress: Progress
-) -> Iterator[None]:
+def _followed(kind: Kind, specs: Sequence[Spec], progress: Progress) -> Iterator[None]:
     """Show the lines that jobs write into their folders, in a thread."""
     ended = threading.Event()
     seen = {spec["seed"]: len(_lines(spec["folder"])) for spec in specs}
     displays = {
-        seed: kind.display(spec["settings"], console, progress, f"seed {seed}: ")
+        spec["seed"]: kind.display(spec["settings"], progress, f"seed {spec['seed']}: ")
         for spec in specs
-        for seed in [spec["seed"]]
     }
 
     def look() -> None:
         for spec in specs:
             seed = spec["seed"]
-            # A folder that comes from another computer may be half there.
+            # A folder that comes from another computer may be incomplete at this moment.
             with contextlib.suppress(ValueError, OSError):
                 lines = _lines(spec["folder"])
                 for line in lines[seen[seed] :]:

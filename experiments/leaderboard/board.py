@@ -28,14 +28,16 @@ HEADINGS = (
     "agent", "place", "mean rank", "whole path", ("ALE", "m"), ("MLE", "m"), ("predict", "ms"),
     "drives", "trainings", "rerun here",
 )  # fmt: skip
-ORIGIN = ("agent", "revision", "versions", "processor", "system", "cost of training", "other here")
+ORIGIN = (
+    "agent", "revision", "versions", "processor", "system", "cost of training", "differs here",
+)  # fmt: skip
 NUMERIC = range(1, 9)
 NOTES = (
     (
-        "A row is an agent in a folder of results. Rows are ranked on the drives of the "
-        "section, which a suite gives to every agent; further drives of a folder do not count. "
-        "A row that lacks some is incomplete: it has no place, and its figures are those of its "
-        "own drives."
+        "A row is an agent in a folder of results. The rows of a section are ranked on the drives "
+        "that its suite gives to every agent; further drives of a folder do not count. A row "
+        "that lacks some of them is incomplete: it has no place, and its figures are those of "
+        "its own drives."
     ),
     (
         "In every drive the rows are ranked: one that fails is behind all that pass, and those "
@@ -48,20 +50,20 @@ NOTES = (
     (
         "ALE and MLE, the root mean square and the largest lateral error, are interquartile "
         "means over drives (Agarwal et al. 2021), a failed drive counting as infinitely bad: "
-        "there is none where more than a quarter failed. Their 95 % intervals are bootstraps "
-        "over drives as in lpv-track compare, stratified by path; agents with several trainings "
-        "have a second one over trainings. Beside the drives that reached the end of their path "
-        "stands the Clopper-Pearson interval of the rate of failures. Of predict there are the "
-        "median over drives of a drive's median, and the largest 99th percentile of a drive, on "
-        "the row's own machine."
+        "they are infinite (∞) where more than a quarter failed. Their 95 % intervals are "
+        "bootstraps over drives as in lpv-track compare, stratified by path; agents with several "
+        "trainings have a second one over trainings. Beside the drives that reached the end of "
+        "their path stands the Clopper-Pearson interval of the rate of failures. The times of predict are "
+        "the median over drives of each drive's median, and the largest 99th percentile of a "
+        "drive (p99), on the row's own machine."
     ),
     (
         "Rerun here: a sample of the row's cases was run again on the machine that made this "
         "page. Where versions, sources and processor are those of the row, every bit must be "
         "the same; elsewhere values must agree within the tolerance of lpv-track reproduce. A "
-        "row of which a case does not reproduce, or of which an id does not fit what the case "
-        "says it drove, has no place. A sample proves nothing of the rest: the command below "
-        "each table runs the same sample again, and without --id all."
+        "row has no place if a case does not reproduce, or if an id does not fit the fields of "
+        "its case. A sample proves nothing about the other cases: the commands below each table "
+        "run the same sample again, and without --id all cases."
     ),
 )
 FROM_OTHERS = (
@@ -85,7 +87,7 @@ class Entry:
     row
         The row.
     mark
-        What its reruns say.
+        Verdict of its reruns.
     place
         Its place, from 1; None if it is not ranked.
     rank
@@ -324,8 +326,8 @@ def markdown(
         parts.append(f"## {escaped(title_of(section))}, {len(section.drives)} drives")
         parts.append(_table(HEADINGS, map(cells, entries), NUMERIC))
         parts.append(_table(ORIGIN, map(origin, entries)))
-        commands = "\n".join(map(command_of, entries))
-        parts.append(f"A sample of each row again:\n\n```sh\n{commands}\n```")
+        commands = "\n".join(dict.fromkeys(map(command_of, entries)))
+        parts.append(f"These commands run a sample again:\n\n```sh\n{commands}\n```")
     parts.append("## How it is made")
     if skipped:
         parts.append(f"Left out, because it cannot be read: {escaped('; '.join(skipped[:5]))}.")

@@ -19,7 +19,7 @@ from experiments.run.tables import Result
 
 
 class Mark(NamedTuple):
-    """What reruns say of a row."""
+    """Verdict of the reruns on a row."""
 
     words: str = "not rerun"
     remark: str = ""
@@ -50,13 +50,13 @@ def marks_of(
     Parameters
     ----------
     rows
-        The rows.
+        Rows, whose ids fit.
     samples
         Cases of each row, by its key.
     engine
         Where the cases run.
     open_named_files
-        Runs the agents and opens the files that cases name; for results that are trusted.
+        True runs the agents and opens the files that cases name: for results that are trusted.
     console
         Receives the progress.
     limit
@@ -89,7 +89,7 @@ def marks_of(
 
 
 def altered(row: Row) -> Mark | None:
-    """Return the mark of a row with a case whose id does not fit its fields; None without any.
+    """Return the mark of a row that has a case whose id does not fit its fields, else None.
 
     Only cases of these sources and versions can be checked, and those that name no files.
     """

@@ -95,7 +95,7 @@ class Row:
 
     @cached_property
     def shared(self) -> list[str]:
-        """Drives that it has, of several trainings those that all have."""
+        """Drives that it has; of several trainings, those that all of them have."""
         if not self.cases:
             return []
         first, *others = self.by_training.values()
@@ -119,7 +119,7 @@ class Row:
 
     @cached_property
     def plan(self) -> Plan:
-        """What a bootstrap of the shared drives draws."""
+        """Plan of a bootstrap of the shared drives."""
         if not self.cases:
             return plan_of([])
         first = next(iter(self.by_training.values()))
@@ -147,7 +147,7 @@ class Section:
     suite
         Name of the suite; "custom" for folders that were made without one.
     seeds
-        Number of seeds that the drives are given for; 1 has the fewest that the suite drives.
+        Number of seeds for which the suite gives the drives; 1: the fewest seeds of each part.
     drives
         The drives on which its rows are compared.
     rows
@@ -173,7 +173,7 @@ def sections_of(folders: Sequence[Path], skipped: list[str]) -> list[Section]:
     Raises
     ------
     ValueError
-        For what is no folder of results, and for a folder that is given twice.
+        For a folder without results, and for one that is given twice.
     """
     resolved = [folder.resolve() for folder in folders]
     for place, folder in enumerate(folders):

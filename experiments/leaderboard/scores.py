@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.run.resampling import Plan, estimates
+from experiments.run.resampling import Plan, bootstrap_intervals, run_weights
 from experiments.run.statistics import weighted_interquartile_mean
 
 Array = NDArray[np.float64]
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 class Score(NamedTuple):
     """Interquartile mean over all drives, with 95 % intervals.
 
-    It and ends are infinite where more drives failed than the mean leaves out.
+    Value and ends are infinite where more drives failed than the mean leaves out.
     """
 
     value: float
@@ -28,12 +28,12 @@ def score(losses: Array, plan: Plan) -> Score:
     """Return the interquartile mean of losses (trainings, drives), which may be infinite."""
 
     def statistic(drives: Array, trainings: Array) -> Array:
-        weights = (trainings[:, :, None] * drives[:, None, :]).reshape(len(drives), -1)
+        weights = run_weights(drives, trainings)
         return weighted_interquartile_mean(losses.ravel(), weights)[None]
 
     count = (len(losses),)
-    over_drives = estimates(statistic, plan, count, draw_trainings=False)
-    over_trainings = estimates(statistic, plan, count, draw_drives=False)
+    over_drives = bootstrap_intervals(statistic, plan, count, draw_trainings=False)
+    over_trainings = bootstrap_intervals(statistic, plan, count, draw_drives=False)
     ends = [
         (float(one.low[0]), float(one.high[0])) if one.resamples else None
         for one in (over_drives, over_trainings)

@@ -14,7 +14,6 @@ from experiments.run.console_tables import (
     against_published,
     key_lines,
     over_seeds,
-    with_interval,
 )
 from experiments.run.excerpts import MOST_LISTED
 from experiments.run.statistics import rate_interval
@@ -155,7 +154,7 @@ def findings(cases: Sequence[Result]) -> list[Tile]:
         shown += [
             (
                 f"{lead}: ALE, {conditions}",
-                f"{with_interval(over_seeds(group, 'ale'))} m",
+                f"{over_seeds(group, 'ale').words(3)} m",
                 f"{remark} of the published" if remark != "–" else "",
             ),
             (

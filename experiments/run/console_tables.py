@@ -72,11 +72,6 @@ def over_seeds(cases: Iterable[Result], key: str) -> Estimate:
     )
 
 
-def with_interval(value: Estimate, decimals: int = 3) -> str:
-    """Write a mean and, where there are some, the half widths of its intervals."""
-    return value.words(decimals)
-
-
 def against_published(cases: Iterable[Result]) -> str:
     """Return the mean of our ALE divided by the published one, as a percentage; "–" without any."""
     shares = [
@@ -106,9 +101,9 @@ def key_lines(cases: Sequence[Result]) -> list[list[str]]:
         lines.append(
             [
                 *line,
-                with_interval(over_seeds(done, "ale")),
+                over_seeds(done, "ale").words(3),
                 f"{worst['metrics']['mle']:.3f} ({path_name(worst.get('trajectory'))})",
-                with_interval(over_seeds(done, "aoe")),
+                over_seeds(done, "aoe").words(3),
                 against_published(done),
                 f"{1e3 * np.median(medians):.3f}",
                 f"{1e3 * max(case['solver']['p99'] for case in done):.2f}",
@@ -130,7 +125,7 @@ class Cell:
     @property
     def error(self) -> str:
         """ALE with its interval."""
-        return with_interval(self.ale)
+        return self.ale.words(3)
 
     @property
     def basis(self) -> str:
@@ -150,8 +145,7 @@ def band_lines(cases: Sequence[Result]) -> list[Line]:
         measured = [
             case for case in group if any(f"ale_{name}" in case["metrics"] for name in BANDS.names)
         ]
-        cells = [_cell(measured, name) for name in BANDS.names]
-        lines.append((label, cells))
+        lines.append((label, [_cell(measured, name) for name in BANDS.names]))
     return lines if any(cell for _, cells in lines for cell in cells) else []
 
 

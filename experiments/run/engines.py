@@ -170,7 +170,7 @@ def local_pool(
     Parameters
     ----------
     specs
-        What to run.
+        Specs to run.
     workers
         Number of processes.
     run

@@ -1,4 +1,4 @@
-"""What is shown of many paths, settings and cases: the first and the worst, and how many there are.
+"""Excerpts of many paths, settings and cases: the first, the worst, and how many there are.
 
 Folders that fit on a page are shown whole.
 """
@@ -18,14 +18,13 @@ MOST_LISTED = 500
 """Most failed cases, warnings and the like that are listed."""
 
 WHOLE = re.compile(r"(\d+ )?finished")
-"""End of a row whose drives all reached the end of the path."""
+"""Text in the column of ends of a row whose drives all reached the end of the path."""
 
 
 def first_and_worst(errors: Mapping[str, float]) -> list[str]:
     """Return at most `MOST_PATHS` paths in their order: half of them the first, half the worst.
 
-    `errors` gives the largest error of each path, inf where a drive did not reach
-    the end.
+    `errors` gives the largest error of each path, inf where a drive did not reach the end.
     """
     names = list(errors)
     if len(names) <= MOST_PATHS:

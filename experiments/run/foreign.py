@@ -14,11 +14,11 @@ from lpv_track_env.vehicle import VEHICLES
 MADE = re.compile(r"(random(-fast|-limit)?|circuit)-\d{1,18}|iso-3888-[12]-\d{1,4}(\.\d{1,8})?")
 """Names of random paths, circuits and lane changes, which no file stands behind."""
 FILE_LIKE = re.compile(r"[/\\.]")
-"""Mark of a setting that may name a file."""
+"""Characters of a setting that may name a file."""
 
 
 def is_path_file(trajectory: str) -> bool:
-    """Return whether a trajectory is a file, or else no name that this project knows."""
+    """Return whether a trajectory is not a name that this project knows, so that it is a file."""
     return trajectory not in trajectories.names() and MADE.fullmatch(trajectory) is None
 
 

@@ -13,7 +13,7 @@ from trajectories.fileio import read_bytes, write_atomically
 
 
 class Held(NamedTuple):
-    """Where the result of an id is: place of its folder, status, digest of its values."""
+    """Result of an id: number of the folder that holds it, status, digest of its values."""
 
     folder: int
     status: str
@@ -33,9 +33,9 @@ def merge(
 ) -> Merged:
     """Join the cases, traces and manifests of folders in `out`, which may hold results already.
 
-    A case that several folders hold must have the same values in all, times apart; of a failed case
-    and one that went well, the latter is kept. All is compared before anything is written. After an
-    interruption, the same call completes `out`.
+    A case that several folders hold must have the same values in all, times apart; if it failed in
+    one and succeeded in another, the success is kept. Everything is compared before anything is
+    written. After an interruption, the same call completes `out`.
 
     Parameters
     ----------
@@ -80,13 +80,13 @@ def merge(
 
 
 def _chosen(stores: Sequence[ResultStore], skipped: list[str]) -> dict[str, Held]:
-    """Return where the result of every id is to be had, after comparing those of several folders.
+    """Return the result to take for every id, after comparing those of several folders.
 
     Messages on lines that cannot be read go to `skipped`.
     """
     chosen: dict[str, Held] = {}
     for place, store in enumerate(stores):
-        # Of several lines in one folder the last counts.
+        # The last of several lines with one id counts.
         found = {result["id"]: _held(place, result) for result in store.stream(skipped)}
         for key, new in found.items():
             old = chosen.setdefault(key, new)
@@ -109,7 +109,7 @@ def _compared(result: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _refuse(key: str, first: ResultStore, second: ResultStore) -> None:
-    """Refuse two results of one id whose values differ; 1 and 1.0 do not."""
+    """Refuse two results of one id whose values differ; 1 and 1.0 are equal."""
     old, new = _last(first, key), _last(second, key)
     for name in sorted({*old, *new}):
         if name not in old or name not in new or old[name] != new[name]:

@@ -85,7 +85,7 @@ def _folder(package: str) -> Path:
 
 
 def revision() -> dict[str, Any]:
-    """Return the digest of the `sources`, and of a checkout its `commit` and if it is `modified`.
+    """Return the digest of the `sources`; of a checkout also `commit` and whether it is `modified`.
 
     An installed wheel has no commit, even inside another project's checkout.
     """
@@ -139,7 +139,7 @@ def version_changes(before: Mapping[str, Any]) -> list[str]:
 def changes_since(before: Mapping[str, Any], packages: Sequence[str]) -> dict[str, list[str]]:
     """Return in words what differs here from a manifest: `versions`, `sources`, `processor`.
 
-    What the manifest does not tell counts as different. Versions are those of `packages`; Python
+    An entry that the manifest lacks counts as different. Versions are those of `packages`; Python
     counts by its minor version. Texts of the manifest, which anybody may have written, are cut.
     """
     changed = _changed_versions(before, ("python", *packages))
@@ -224,7 +224,7 @@ def processor_features() -> tuple[str, tuple[str, ...]]:
 
 
 def hardware() -> dict[str, Any]:
-    """Return processor and what it can (`processor_features`), cores, memory (GiB) and system."""
+    """Return processor, its features (`processor_features`), cores, memory (GiB) and system."""
     processor = platform.processor() or platform.machine()
     memory = None
     try:

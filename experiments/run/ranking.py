@@ -38,9 +38,9 @@ LARGER_IS_BETTER = ("highest_fixed_speed",)
 
 
 LEAST_RESAMPLES, MOST_DRAWN = 1000, 50_000_000
-"""Of many drives fewer resamples are drawn, so that all of them have at most so many drives."""
+"""Fewest resamples, and most drives in all of them together: many drives get fewer resamples."""
 MOST_AT_ONCE = 4_000_000
-"""Most counts that are in memory at once."""
+"""Most numbers that are in memory at once."""
 
 
 class Place(NamedTuple):
@@ -153,7 +153,7 @@ def _mean_ranks(losses: Sequence[Array], random: np.random.Generator) -> tuple[A
 def _expected_ranks(
     losses: Sequence[Array], agents: NDArray[np.int64], random: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Return the same where agents have several trainings; `agents` has the agent of each entry.
+    """Return what `_mean_ranks` does for several trainings; `agents` has the agent of each entry.
 
     The rank among one training of every other agent is 1 plus the number of those ahead, so that
     its mean over all combinations of trainings is 1 plus a sum over pairs.
@@ -178,7 +178,7 @@ def _expected_ranks(
 
 
 def _ahead(losses: Array, agents: NDArray[np.int64]) -> Array:
-    """Return in how far entry f is ahead of entry e in each drive, (drives, e, f).
+    """Return how far entry f is ahead of entry e in each drive, (drives, e, f).
 
     It is 1 for a lower loss, 0.5 for an equal one, and 0 among the entries of one agent.
     """

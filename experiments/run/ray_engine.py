@@ -1,8 +1,8 @@
 """Engine that runs specs over the computers of a Ray cluster.
 
-An actor a CPU keeps a child process that runs one spec after another, as a local worker does. At
-most one spec is with an actor, so a sweep of any length holds few objects. The spec of a lost actor
-runs again elsewhere. Nothing is left on a cluster but Ray itself.
+Each CPU has an actor, whose child process runs one spec after another, as a local worker does. An
+actor has one spec at a time, so that a sweep of any length holds few objects. The spec of a lost
+actor runs again elsewhere. Nothing is left on a cluster but Ray itself.
 """
 
 import contextlib
@@ -40,7 +40,7 @@ TURN = 1.0
 MOST_LOSSES = 5
 """Losses of its actor after which a spec has failed."""
 MOST_STARTING = 60.0
-"""Time without a new actor after which a sweep that has none ends when one fails to start, s."""
+"""Time since the last hello after which a sweep without actors ends if none can start, s."""
 SAID = 20.0
 """Time without any actor after which the user is told, s."""
 LOST = f"the worker that ran it was lost, {MOST_LOSSES} times"
@@ -98,23 +98,24 @@ class _Task:
 
 @dataclass(eq=False)
 class _Hand:
-    """An actor and what it is at: saying hello, idle, or the spec of a number."""
+    """An actor and its state: it says hello, is idle, or runs the spec of a number."""
 
     actor: Any
     at: Any
-    """Reference to what it answers; None if it is idle."""
+    """Reference to the answer that it owes; None if it is idle."""
     node: str | None = None
     address: str = ""
     number: int | None = None
+    """Place of its spec in the sweep."""
     versions: Mapping[str, str] = field(default_factory=dict)
     folder: Path | None = None
     """Folder of the spec, which travels there and back."""
     known: dict[str, str] = field(default_factory=dict)
-    """Digests of the files that the folder holds here, as far as they travelled."""
+    """Digests of those of the folder's files that have travelled."""
     copy: Any = None
     """Reference to changes in the folder."""
     copied: float = 0.0
-    """When they were asked for, s."""
+    """Time at which they were last asked for, s."""
     token: Path | None = None
     """File by which the actor sees that it has the folder itself."""
 
@@ -140,7 +141,7 @@ class _Sweep:
         self._losses: Counter[int] = Counter()
         self._hands: list[_Hand] = []
         self._again: set[int] = set()
-        """Specs that wait again."""
+        """Specs that have started before, and wait again."""
         self._refused: dict[str, str] = {}
         self._looked, self._greeted = -math.inf, time.monotonic()
         self._said = False
@@ -181,7 +182,7 @@ class _Sweep:
                 self._take_copy(copies[reference])
             else:
                 results += self._hear(waiting[reference])
-        # Whoever reads the results may take his time.
+        # The caller may take long over the results: actors are not to be idle meanwhile.
         self._assign()
         return results
 
@@ -201,7 +202,7 @@ class _Sweep:
         if self._refused:
             options["label_selector"] = {"ray.io/node-id": f"!in({','.join(self._refused)})"}
         while len(self._hands) < min(self._most or cpus, waiting):
-            actor = self._class.options(**options).remote()  # type: ignore[attr-defined]
+            actor = self._class.options(**options).remote()
             self._hands.append(_Hand(actor, actor.hello.remote()))
 
     def _say_waiting(self) -> None:
@@ -216,17 +217,17 @@ class _Sweep:
         self._ray.kill(hand.actor)
 
     def _refuse(self, hand: _Hand, reason: str) -> None:
-        """Use the node of a hand no more, and say so."""
+        """Stop using the node of a hand, and say so."""
         assert hand.node is not None
         line = f"node {hand.address} refuses: {reason}"
         if hand.node not in self._refused:
             warnings.warn(line, UserWarning, stacklevel=2)
         self._refused[hand.node] = line
-        # Its others are at work that they have accepted, or will refuse likewise.
+        # The node's other actors end what they have accepted, or refuse likewise.
         self._drop(hand)
 
     def _greet(self, hand: _Hand, there: Mapping[str, Any]) -> None:
-        """Take a hand that has said hello on, if it would compute the same."""
+        """Accept a hand that has said hello, if it computes the same."""
         hand.node, hand.address, hand.at = there["node"], there["address"], None
         hand.versions = there.get("versions", {})
         self._greeted = time.monotonic()
@@ -346,7 +347,7 @@ class _Sweep:
         self._again.add(number)
 
     def _finish(self, hand: _Hand) -> int:
-        """Free a hand of its spec, and return that one's number."""
+        """Take the spec from a hand, and return its number."""
         assert hand.number is not None
         number, hand.number, hand.at, hand.copy = hand.number, None, None, None
         if hand.token is not None:

@@ -1,4 +1,4 @@
-"""Connection to a Ray cluster, or a Ray of this computer's own."""
+"""Connection to a Ray cluster, or to a Ray that is started on this computer."""
 
 import contextlib
 import logging
@@ -13,7 +13,7 @@ from trajectories.arguments import shortened, shown
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    # All of what Ray prints about other processes, such as the log of a node that was lost.
+    # Matches all that Ray prints about other processes, such as the log of a node that was lost.
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".",
 }
 """Environment that keeps Ray's own messages off the screen, and GPUs visible."""
@@ -25,9 +25,23 @@ STORE = 2**29
 
 @contextlib.contextmanager
 def connected(workers: int | None, address: str | None) -> Iterator[None]:
-    """Connect to a cluster, or start a Ray on this computer; it ends with the context.
+    """Connect to a cluster, or start a Ray on this computer, which ends with the context.
 
-    Where this process uses a Ray already, that one is used.
+    If this process is connected to a Ray already, that one is used.
+
+    Parameters
+    ----------
+    workers
+        Number of CPUs of a Ray on this computer; None: all.
+    address
+        Address of the cluster; None: a Ray on this computer.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If Ray is not installed.
+    ValueError
+        If there is no Ray at the address, or none can be started.
     """
     wanted = QUIET | LOOPBACK if address is None else QUIET
     os.environ.update({key: value for key, value in wanted.items() if key not in os.environ})

@@ -1,7 +1,7 @@
 """Worker side of the Ray engine: keeps a child process that runs one order after another.
 
-An order and its answer are plain dictionaries. The numerical libraries load in the child alone; if
-it dies or exceeds its time, this process says so and starts another.
+An order and its answer are plain dictionaries. Runs take place in the child alone; if it dies or
+exceeds its time, this process says so and starts another.
 """
 
 import contextlib
@@ -10,7 +10,7 @@ import pickle
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -41,7 +41,7 @@ LEFT_BY = "lpv-track-ray-"
 
 
 def about() -> dict[str, Any]:
-    """Return what must be the same on all computers of a sweep, and the manifest's entries."""
+    """Return sources and versions, the same on all computers of a sweep, and provenance."""
     return {
         "sources": shipping.sources_digest(),
         "versions": provenance.computing_versions(*_packages()),
@@ -150,7 +150,7 @@ class Host:
 def _remove_leftovers() -> None:
     """Remove the folders of workers that were killed."""
     for folder in Path(tempfile.gettempdir()).glob(f"{LEFT_BY}*"):
-        # Another process's, or one that is just made or removed.
+        # It may be another process's, or be made or removed at this moment.
         with contextlib.suppress(ValueError, OSError):
             if folder.stat().st_uid == os.getuid() and any(folder.iterdir()):
                 with locked(folder):
@@ -168,14 +168,14 @@ class _Packed:
 
 
 def packed(run: Run, identity: Identity | None) -> bytes:
-    """Return what runs the orders of a sweep in a child process, for the entry `call` of each."""
+    """Pickle the function that runs a sweep's orders in a child process, for their `call`."""
     return pickle.dumps(partial(_run, run, identity))
 
 
 def _run(run: Run, identity: Identity | None, order: Order) -> Answer:
     """Run an order in the child process."""
     try:
-        spec = pickle.loads(order["spec"])  # noqa: S301  sent by who started us
+        spec = pickle.loads(order["spec"])  # noqa: S301  sent by the engine
         with contextlib.chdir(order["place"]):
             if identity is not None and identity(spec) != order["id"]:
                 return {"kind": "refused", "content": OTHER_ID}
@@ -184,10 +184,10 @@ def _run(run: Run, identity: Identity | None, order: Order) -> Answer:
         return {"kind": "raised", "content": pickled_exception(error)}
 
 
-def actor_class() -> Callable[..., Any]:
+def actor_class() -> Any:
     """Return the class of the actors, which Ray sends to its workers by value.
 
-    So a worker can say for itself that it lacks the project, or has another version of it.
+    A worker can thus tell by itself that it lacks the project, or has another version of it.
     """
     import ray
 
@@ -202,7 +202,7 @@ def actor_class() -> Callable[..., Any]:
 
                 self.host = Host()
                 return {**where, **about()}
-            except Exception as error:  # noqa: BLE001  whatever is wrong with what is there
+            except Exception as error:  # noqa: BLE001  anything can be wrong with an installation
                 return {**where, "missing": f"{type(error).__name__}: {error}"}
 
         def run(self, order: dict[str, Any], files: dict[str, Any], content: Any) -> Any:
@@ -221,7 +221,4 @@ def actor_class() -> Callable[..., Any]:
         def close(self) -> None:
             self.host.close()
 
-    made: Callable[..., Any] = ray.remote(
-        num_cpus=1, max_concurrency=2, max_restarts=0, max_task_retries=0
-    )(Actor)
-    return made
+    return ray.remote(num_cpus=1, max_concurrency=2, max_restarts=0, max_task_retries=0)(Actor)

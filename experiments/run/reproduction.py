@@ -41,11 +41,11 @@ three), and 7e-4 in one, of the NMPC at the limit of friction.
 ALTERED = "its fields or files were changed after it was driven"
 MEASURED = "delays are measured on the machine and differ from run to run"
 SAME: Mapping[str, Sequence[str]] = {"versions": (), "sources": (), "processor": ()}
-"""What differs where the manifest's key is that of this machine."""
+"""Changes of a manifest whose key is that of this machine: none."""
 
 
 class NotRunError(ValueError):
-    """Reason why a sound row is not run again."""
+    """A sound row is not run again, for the reason that it names."""
 
 
 @dataclass(frozen=True)
@@ -165,9 +165,9 @@ def prepared(
     manifest_of
         Returns the manifest of a key, such as `ResultStore.manifest_of`; None knows none.
     open_named_files
-        Runs the agents and opens the files that results name; for results that are trusted.
+        True runs the agents and opens the files that results name: for results that are trusted.
     whole
-        A value that a result lacks is a difference.
+        True counts a value that a result lacks as a difference.
     """
     rows, here = Rows(), manifest_key()
 
@@ -268,7 +268,7 @@ def reproduce(
     limit
         Time limit of a case, s.
     exact
-        Compares bits even where versions, sources or processor differ.
+        True compares bits even where versions, sources or processor differ.
     started
         Called with the fields of each case as it starts.
     """
@@ -321,7 +321,7 @@ def judged(row: Row, result: Result, *, exact: bool) -> Verdict:
         return Verdict(row, exact, note=f"failed there: {error}; here: {now}")
     names = [*there, *(name for name in here if name not in there and row.whole and row.same_code)]
     if there.get("status", "ok") != here["status"]:
-        # Why it failed, not every value that is missing for that.
+        # A failed case lacks most values: only the failure itself is told.
         names = [name for name in ("status", "end", "error") if name in there or name in here]
     if not exact:
         # The last digit decides to which band a place at its edge belongs.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import DegenerateDataWarning, bootstrap, norm
 from scipy.stats import t as student
 
-from experiments.run.statistics import CONFIDENCE, RESAMPLES, Interval, weighted_interquartile_mean
+from experiments.run.statistics import CONFIDENCE, RESAMPLES
 
 Array = NDArray[Any]
 Statistic = Callable[..., Array]
@@ -106,7 +106,7 @@ def _words(strata: dict[tuple[str, Hashable], set[int]], paths: int, *, kept: bo
 
 
 @dataclass(frozen=True)
-class Estimates:
+class Intervals:
     """Statistics of all drives, (statistics,), and the ends of their intervals.
 
     An end is NaN where there is nothing to draw.
@@ -118,7 +118,7 @@ class Estimates:
     resamples: int
 
 
-def estimates(
+def bootstrap_intervals(
     statistic: Statistic,
     plan: Plan,
     trainings: Sequence[int] = (),
@@ -126,7 +126,7 @@ def estimates(
     draw_drives: bool = True,
     draw_trainings: bool = True,
     seed: int = 0,
-) -> Estimates:
+) -> Intervals:
     """Compute statistics and their 95 % expanded percentile intervals by SciPy's bootstrap.
 
     Strata are resampled independently of one another, and of the trainings of each competitor,
@@ -154,7 +154,7 @@ def estimates(
     samples += [np.arange(trainings[k]) for k in sides]
     if not samples:
         none = np.full(value.shape, np.nan)
-        return Estimates(value, none, none, 0)
+        return Intervals(value, none, none, 0)
     units = int(plan.unit.max()) + 1
 
     def of(*indices: Array, axis: int) -> Array:
@@ -183,7 +183,13 @@ def estimates(
     freedom = [sum(len(found) for found in strata) - len(strata)] if strata else []
     freedom += [trainings[k] - 1 for k in sides]
     low, high = _ends(result.bootstrap_distribution, _tail(min(freedom), max(1, len(strata))))
-    return Estimates(value, low, high, resamples)
+    return Intervals(value, low, high, resamples)
+
+
+def run_weights(drives: Array, trainings: Array) -> Array:
+    """Return how often each run is drawn, (resamples, trainings x drives), from those of both."""
+    weights: Array = (trainings[:, :, None] * drives[:, None, :]).reshape(len(drives), -1)
+    return weights
 
 
 def _counts(drawn: Array, number: int) -> Array:
@@ -215,18 +221,3 @@ def _ends(drawn: Array, tail: float) -> tuple[Array, Array]:
     low = ordered[rows, np.floor(tail * last).astype(int)]
     high = ordered[rows, np.ceil((1.0 - tail) * last).astype(int)]
     return low, high
-
-
-def iqm_interval(losses: Array, plan: Plan, *, seed: int = 0) -> Interval:
-    """Estimate the interquartile mean of losses (trainings, drives), with its interval.
-
-    The interval is over the trainings, if there are several, and over the plan's drives.
-    """
-    table = np.atleast_2d(losses)
-
-    def statistic(drives: Array, trainings: Array) -> Array:
-        weights = (trainings[:, :, None] * drives[:, None, :]).reshape(len(drives), -1)
-        return weighted_interquartile_mean(table.ravel(), weights)[None]
-
-    found = estimates(statistic, plan, (len(table),), seed=seed)
-    return Interval(float(found.value[0]), float(found.low[0]), float(found.high[0]))

@@ -27,7 +27,10 @@ TRIES = 20
 
 @cache
 def sources_digest() -> str:
-    """Return the digest of all files of this project that a run depends on."""
+    """Return the digest of this project's sources and data, on which a training depends.
+
+    `provenance.project_digest`, which goes into ids, is that of the sources which cases depend on.
+    """
     digest = hashlib.sha256()
     for file in sorted(one for name in PACKAGES for one in (PROJECT / name).rglob("*")):
         if file.suffix in SUFFIXES:
@@ -52,7 +55,7 @@ def with_weights(files: Iterable[Path]) -> list[Path]:
             continue
         try:
             name = read_json(file, MOST_SPEC)["weights"]["file"]
-        except (ValueError, TypeError, LookupError):  # no policy: whoever reads it will say so
+        except (ValueError, TypeError, LookupError):  # no policy: its reader will say so
             continue
         if isinstance(name, str) and BESIDE.fullmatch(name) and file.with_name(name).is_file():
             found[file.with_name(name)] = None
@@ -60,7 +63,7 @@ def with_weights(files: Iterable[Path]) -> list[Path]:
 
 
 def contents(files: Iterable[Path]) -> dict[str, bytes]:
-    """Read files by name, without those of the project, which every worker has."""
+    """Return the content of files by name, without those of the project: every worker has them."""
     own = [PROJECT / name for name in PACKAGES]
     return {
         str(file): file.read_bytes()
@@ -70,7 +73,7 @@ def contents(files: Iterable[Path]) -> dict[str, bytes]:
 
 
 class Place:
-    """A folder of a worker's own that stands for the working directory of whoever sent a run.
+    """A folder of a worker's own that stands for the working directory of a run's sender.
 
     `folder` lies some levels deep, so that names such as `../paths/mine.csv` stay within `root`.
     """
@@ -161,8 +164,8 @@ def _listing(folder: Path) -> dict[str, tuple[int, int, int]]:
 def apply(folder: Path, changed: Changes, known: Mapping[str, str]) -> dict[str, str]:
     """Write changes into a folder, in the order in which they were made; return the new digests.
 
-    Whoever is killed meanwhile leaves a state that the run itself could have left. Known files that
-    are there no more are removed.
+    A process that is killed meanwhile leaves a state that the run itself could have left. Known
+    files that are gone are removed.
 
     Raises
     ------

@@ -209,7 +209,7 @@ def paired_failures(first_alone: int, second_alone: int) -> float:
     """Return the p-value of McNemar's exact test that both sides fail equally often.
 
     Of the drives that one side alone fails, either side's share is 1/2 by the null hypothesis: a
-    two-sided binomial test. Without any the p-value is 1.
+    two-sided binomial test. Without any such drive the p-value is 1.
     """
     differing = first_alone + second_alone
     return float(binomtest(first_alone, differing).pvalue) if differing else 1.0

@@ -36,6 +36,7 @@ MOST_UNREADABLE = 10_000
 TOGETHER = 1.0
 """Time within which results that a sweep stores reach the disk together, s."""
 BLOCK = 2**16
+"""Bytes that are read at once."""
 LARGEST_TRACE = 2**28
 """Largest trace that is read, bytes on disk and in memory."""
 LARGEST_NUMBER = 1e12
@@ -123,7 +124,7 @@ class ResultStore:
     def stream(
         self, skipped: list[str] | None = None, read: Callable[[bytes, str], Case] = read_case
     ) -> Iterator[Case]:
-        """Yield the result of each line, in bounded memory; the last line of an id counts.
+        """Yield the result of each line, in bounded memory; of lines with one id the last counts.
 
         Parameters
         ----------
@@ -174,8 +175,8 @@ class ResultStore:
         """Return the results in the order of their first lines, without traces.
 
         The last line of an id counts. Results are read-only and share what they have in common
-        (`experiments.run.compact`); `dict(result)` is none of it deep, `result_schema.plain` all.
-        Parameters and errors are those of `stream`.
+        (`experiments.run.compact`): `dict(result)` copies the outer mapping alone,
+        `result_schema.plain` all of it. Parameters and errors are those of `stream`.
         """
         sharing = Sharing()
         every = self.stream(skipped, read)
@@ -235,9 +236,9 @@ class ResultStore:
         return found
 
     def manifest_of(self, key: str) -> dict[str, Any]:
-        """Return the manifest with a key, that of the last run or an earlier one; {} without it.
+        """Return the manifest with a key, of the last run or an earlier one; {} if there is none.
 
-        Results of old versions name none; theirs has the key "before".
+        Results of old versions name no manifest; theirs has the key "before".
         """
         last = self.manifest()
         if last and last.get("key", "before") == key:
@@ -252,7 +253,7 @@ class _Lines:
     """
 
     def __init__(self, file: Path) -> None:
-        # Unbuffered: what is written is the system's, whatever becomes of this process.
+        # Unbuffered: the system has what is written, whatever becomes of this process.
         self._handle: BinaryIO = file.open("a+b", buffering=0)
         self._end = -1
         self._lock, self._disk = threading.Lock(), threading.Lock()
@@ -262,7 +263,7 @@ class _Lines:
         self._failed: OSError | None = None
 
     def append(self, line: bytes, trace: Path | None) -> None:
-        """Write a line whole or not at all; its trace is to reach the disk before it."""
+        """Write a line whole or not at all; its trace reaches the disk before it."""
         with self._lock:
             if self._failed is not None:
                 raise self._failed
@@ -301,7 +302,7 @@ class _Lines:
         return end
 
     def _sync(self) -> None:
-        """Bring to the disk what was appended; the next call of `append` raises what went wrong."""
+        """Bring to the disk what was appended; the next `append` raises an error of this."""
         with self._disk:
             with self._lock:
                 traces, self._unsynced, self._planned = self._unsynced, [], False

@@ -34,7 +34,7 @@ class Trained(NamedTuple):
 
 
 def trained(case: Mapping[str, Any]) -> Trained:
-    """Return what a case's agent is called, and which of its trainings the case drives.
+    """Return the name of a case's agent, and which of its trainings the case drives.
 
     The policies in `FOLDER/seed-N/policy.json` are one agent called FOLDER, and so is
     `lpv-nmpc-tuned` with the weights in `FOLDER/seed-N/weights.json`.

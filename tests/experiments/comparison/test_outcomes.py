@@ -1,4 +1,4 @@
-"""Who meets whom, on which drives, and what comes out, against values by hand."""
+"""Pairs of competitors, their drives and the results of a comparison, against values by hand."""
 
 import math
 from pathlib import Path

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from rich.progress import Progress
 
 from experiments import cli
 from experiments.jobs import several
@@ -55,8 +56,7 @@ def test_trainings_side_by_side_have_the_bits_of_those_alone(tmp_path: Path) -> 
         )  # fmt: skip
         return settings, f"lpv-track train ppo --seed {own.seed}"
 
-    def display(settings: TrainingSettings, *given: Any) -> TrainingDisplay:
-        console, progress, prefix = given
+    def display(settings: TrainingSettings, progress: Progress, prefix: str) -> TrainingDisplay:
         return TrainingDisplay(console, "ppo", settings.steps, progress, prefix)
 
     def finished(_settings: Any, folder: Path) -> bool:
@@ -158,7 +158,7 @@ def test_ctrl_c_leaves_every_seed_resumable(
         (["--seed", "1", "--seeds", "2"], "not allowed with"),
         (["--seeds", "1", "2", "1"], "--seeds names a seed twice: 1 2 1"),
         (["--seeds", "1000"], "--seeds must be"),
-        (["--workers", "2"], "are for several: give --seeds"),
+        (["--workers", "2"], "are for several seeds: give --seeds"),
         (["--address", "auto", "--seeds", "1"], "needs --engine ray"),
     ],
 )

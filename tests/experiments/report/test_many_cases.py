@@ -46,7 +46,7 @@ def test_half_of_the_paths_are_the_first_and_half_the_worst(few: None) -> None:
     errors = {f"{k}": error for k, error in enumerate((1.0, 0.0, 2.0, np.inf, 3.0, 9.0))}
     assert first_and_worst(errors) == ["0", "1", "3", "5"]
     assert first_and_worst(dict(list(errors.items())[:4])) == ["0", "1", "2", "3"]
-    # Of equally bad ones the earlier.
+    # Among equally bad ones the earlier come first.
     assert first_and_worst({f"{k}": 1.0 for k in range(6)}) == ["0", "1", "2", "3"]
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import binom, mannwhitneyu, norm, trim_mean, ttest_1samp
 
 from experiments.run import resampling
-from experiments.run.resampling import estimates, iqm_interval, plan_of
+from experiments.run.resampling import bootstrap_intervals, plan_of, run_weights
 from experiments.run.statistics import (
     optimality_gap,
     paired_failures,
@@ -114,13 +114,13 @@ def test_performance_profile_by_hand() -> None:
 
 
 def test_mcnemars_exact_test_by_hand() -> None:
-    # Of five differing drives one side fails all: 2 * (1/2)^5.
+    # One side fails all of five differing drives: 2 * (1/2)^5.
     assert paired_failures(5, 0) == pytest.approx(2 / 32)
     assert paired_failures(3, 3) == 1.0
     assert paired_failures(0, 0) == 1.0
 
 
-# What is drawn -----------------------------------------------------------------------------------
+# Plans of draws -----------------------------------------------------------------------------------
 
 
 def drawn(cells: list[tuple[Any, Any, Any]]) -> list[list[int]]:
@@ -160,46 +160,47 @@ def mean_of(values: Array) -> Any:
 
 
 def test_one_drive_alone_has_no_interval() -> None:
-    found = estimates(mean_of(np.array([3.0])), plan_of([("a", "T2", 0)]))
+    found = bootstrap_intervals(mean_of(np.array([3.0])), plan_of([("a", "T2", 0)]))
     assert found.value.tolist() == [3.0]
     assert np.isnan([found.low[0], found.high[0]]).all()
     assert found.resamples == 0
 
 
 def test_trainings_and_drives_are_drawn_apart() -> None:
-    """Where only trainings differ, draws of drives alone leave no spread, and the reverse."""
+    """Trainings differ, drives do not: draws of drives alone have no spread."""
     plan = plan_of([("a", "T2", seed) for seed in range(4)])
     by_training, by_drive = np.array([1.0, 2.0, 3.0]), np.zeros(4)
     table = by_training[:, None] + by_drive
 
     def mean(drives: Array, trainings: Array) -> Array:
-        runs = (trainings[:, :, None] * drives[:, None]).reshape(len(drives), -1)
+        runs = run_weights(drives, trainings)
         return ((runs @ table.ravel()) / runs.sum(axis=1))[None]
 
-    drives_alone = estimates(mean, plan, (3,), draw_trainings=False)
-    trainings_alone = estimates(mean, plan, (3,), draw_drives=False)
+    drives_alone = bootstrap_intervals(mean, plan, (3,), draw_trainings=False)
+    trainings_alone = bootstrap_intervals(mean, plan, (3,), draw_drives=False)
     assert drives_alone.low == drives_alone.high == 2.0
     assert trainings_alone.low == 1.0
     assert trainings_alone.high == 3.0
-    assert iqm_interval(table, plan) == iqm_interval(table, plan)
 
 
 def test_many_drives_are_resampled_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resampling, "MOST_DRAWS", 160_000)
     values = np.random.default_rng(0).normal(size=100)
     plan = plan_of([("a", "T2", seed) for seed in range(100)])
-    found = estimates(mean_of(values), plan)
+    found = bootstrap_intervals(mean_of(values), plan)
     assert found.resamples == 1600
     monkeypatch.setattr(resampling, "MOST_DRAWS", 6)
-    assert estimates(mean_of(values), plan).resamples == resampling.FEWEST
+    assert bootstrap_intervals(mean_of(values), plan).resamples == resampling.FEWEST
 
 
 def test_intervals_of_few_drives_are_as_wide_as_those_of_students_t() -> None:
-    """Of a mean of normals the two agree, ten drives or forty."""
+    """The two agree for the mean of normals, with ten drives or forty."""
     rng = np.random.default_rng(4)
     for number in (10, 40):
         values = rng.normal(size=number)
-        found = estimates(mean_of(values), plan_of([("a", "T2", seed) for seed in range(number)]))
+        found = bootstrap_intervals(
+            mean_of(values), plan_of([("a", "T2", seed) for seed in range(number)])
+        )
         exact = ttest_1samp(values, 0.0).confidence_interval()
         width = float(found.high[0] - found.low[0])
         assert width == pytest.approx(exact.high - exact.low, rel=0.08)
@@ -230,7 +231,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say(
                 ]
             )
 
-        found = estimates(statistic, plan, seed=study)
+        found = bootstrap_intervals(statistic, plan, seed=study)
         # P(X < Y) of normals 0.5 apart, each of variance 1 + shared^2, other seeds included.
         truth = 0.5, 0.0, norm.cdf(0.5 / np.sqrt(2.0 * (1.0 + shared**2)))
         held += (found.low <= truth) & (truth <= found.high)

@@ -116,7 +116,7 @@ def test_regimes_count_the_drives_of_all_trainings_and_show_the_range_of_their_f
     name, drives, failed, interval, mle, *_ = line.cells
     assert (name, drives, failed) == ("r/ppo, 3 trainings", "6", "1")
     assert interval.endswith(", 0–50 % by training")
-    # Of those that finished: 0.14; 0.12; 0.15.
+    # Means of the drives that finished: 0.14; 0.12; 0.15.
     spread = T_975_2 * np.std([0.14, 0.12, 0.15], ddof=1) / 3**0.5
     assert mle == f"0.136 ±{spread:.3f}"
 
