@@ -42,8 +42,8 @@ NOTES = (
     (
         "In every drive the rows are ranked: one that fails is behind all that pass, and those "
         "that pass by the first figure of their regime (MLE; from a start ALE; entry speed; "
-        "fastest lap). An agent with several trainings has the mean rank of one of them. The "
-        "mean rank counts every regime alike, and in suites without regimes every setting; its "
+        "fastest lap). An agent with several trainings has the mean rank over them. The mean rank "
+        "counts every regime alike, and in suites without regimes every setting; its "
         "95 % interval is a bootstrap over the drives of each, and over trainings. It depends "
         "on who else is on the board."
     ),
@@ -53,8 +53,8 @@ NOTES = (
         "they are infinite (∞) where more than a quarter failed. Their 95 % intervals are "
         "bootstraps over drives as in lpv-track compare, stratified by path; agents with several "
         "trainings have a second one over trainings. Beside the drives that reached the end of "
-        "their path stands the Clopper-Pearson interval of the rate of failures. The times of predict are "
-        "the median over drives of each drive's median, and the largest 99th percentile of a "
+        "their path stands the Clopper-Pearson interval of the rate of failures. The times of "
+        "predict are the median over drives of each drive's median, and the largest 99th percentile of a "
         "drive (p99), on the row's own machine."
     ),
     (
