@@ -66,7 +66,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     # LaTeX is printed alone.
     told = Console(stderr=True) if options.latex else console
     for line in skipped:
-        told.print(f"left out: {line}", markup=False, style="red")
+        told.out(f"left out: {line}", style="red", highlight=False)
     if not options.latex:
         console.out(f"in {options.out}: {', '.join(written)}", highlight=False)
     return 0

@@ -39,10 +39,17 @@ def mine(tmp_path: Path) -> Path:
     return tmp_path / "mine_&_yours"
 
 
+@pytest.fixture
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write no figures, which take most of the time."""
+    monkeypatch.setattr("experiments.comparison.written.write_figures", lambda *_: [])
+
+
 def compare(*arguments: object) -> int:
     return main(["compare", *map(str, arguments)])
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_the_table_says_what_a_b_and_the_signs_are(
     mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -66,6 +73,7 @@ def test_the_table_says_what_a_b_and_the_signs_are(
     assert capsys.readouterr().out.replace(str(again), str(tmp_path / "out")) == said
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_files_hold_all_numbers(mine: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert compare(mine, "--out", out, "--seed", 7, "--target", "ale=0.1") == 0
@@ -122,6 +130,7 @@ def groups(text: str) -> Any:
     return stack[0]
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_latex_is_a_table_of_equal_rows(
     mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,6 +163,7 @@ def test_names_are_escaped() -> None:
     )
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_folders_of_namesakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     errors = {"T2": [0.1, 0.2, 0.3]}
     folder(tmp_path / "a", ("stanley", errors), ("pid", errors))
@@ -183,6 +193,7 @@ def test_what_all_failed_is_compared(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert ale["improvement"]["value"] == 0.5
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_crashed_cases_are_failures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = results("stanley", {"T2": [0.1, 0.2]})
     made += [case(100 + k, "pid", seed=k, conditions="realtime", status="failed", end=None)
@@ -192,6 +203,7 @@ def test_crashed_cases_are_failures(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "B 2 of 2" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_scenes_of_traffic_are_drives_too(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -237,14 +249,20 @@ def test_a_folder_without_results_is_refused(
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_damaged_lines_are_told(
     mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lines = mine / "cases.jsonl"
     good = lines.read_bytes()
     lines.write_bytes(good + b'{"id": 3}\n')
+    words = f"left out: {lines}, line 21"
     assert compare(mine, "--out", tmp_path / "out") == 0
-    assert "left out:" in capsys.readouterr().out
+    assert words in " ".join(capsys.readouterr().out.split())
+    assert compare(mine, "--out", tmp_path / "out", "--latex") == 0
+    said = capsys.readouterr()
+    assert said.out.endswith("\\end{tabular}\n")
+    assert words in " ".join(said.err.split())
 
 
 def test_digits_follow_the_numbers(mine: Path) -> None:

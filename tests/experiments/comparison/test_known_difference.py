@@ -25,7 +25,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Compare:
     root = tmp_path_factory.mktemp("driven")
     bends = []
     for name, radius in (("wide", 25.0), ("narrow", 15.0)):
-        angle = np.linspace(0.0, 25.0 / radius, 26)
+        angle = np.linspace(0.0, 13.0 / radius, 14)
         points = radius * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)])
         bends.append(root / f"{name}.csv")
         np.savetxt(bends[-1], points, delimiter=",", header="x,y", comments="")
