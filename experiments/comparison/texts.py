@@ -245,8 +245,8 @@ def _plural(count: int, word: str) -> str:
 
 
 def escaped(text: str) -> str:
-    """Return a text with LaTeX's own characters escaped."""
-    return "".join(ESCAPED.get(character, character) for character in text)
+    """Return a text as a line with LaTeX's own characters escaped."""
+    return "".join(ESCAPED.get(character, character) for character in _flat(text))
 
 
 def latex(outcomes: Sequence[Outcome], comment: Sequence[str]) -> str:
@@ -297,6 +297,12 @@ def _flat(line: str) -> str:
     return " ".join(line.split())
 
 
+def _no_formula(text: str) -> str:
+    """Return a text as a line that a spreadsheet does not take for a formula to execute."""
+    line = _flat(text)
+    return f"'{line}" if line.startswith(("=", "+", "-", "@")) else line
+
+
 CSV_COLUMNS = (
     "baseline", "baseline_folder", "competitor", "competitor_folder", "metric", "unit",
     "less_is_better", "drives", "pairs_both_passed", "mean_a", "mean_b", "difference",
@@ -314,7 +320,11 @@ def as_csv(outcomes: Sequence[Outcome]) -> str:
     writer.writerow(CSV_COLUMNS)
     for outcome in outcomes:
         for one in outcome.metrics:
-            names = outcome.a.label, outcome.a.folder, outcome.b.label, outcome.b.folder
+            names = (
+                _no_formula(str(name))
+                for side in (outcome.a, outcome.b)
+                for name in (side.label, side.folder)
+            )
             estimates = one.difference, one.relative, one.iqm_a, one.iqm_b, one.improvement
             gap_cells = [
                 cell

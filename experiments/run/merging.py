@@ -49,8 +49,8 @@ def merge(
     Raises
     ------
     ValueError
-        In one line: for a folder without results, one that is `out`, or a case with two values of a
-        metric.
+        In one line: for a folder without results, one that is `out`, one whose files are links, or
+        a case with two values of a metric.
     """
     for folder in folders:
         if folder.resolve() == out.resolve():
@@ -58,9 +58,9 @@ def merge(
         if not (folder / "cases.jsonl").is_file():
             raise ValueError(f"{shortened(folder)}: holds no results to merge")
     with locked(out):
-        if (out / TRACES).is_symlink():
-            raise ValueError(f"{out / TRACES} is a link: results are written into {out} only")
         stores = [ResultStore(folder) for folder in (out, *folders)]
+        for store in stores:
+            _refuse_links(store)
         skipped: list[str] = []
         chosen = _chosen(stores, skipped)
         missing = {key: held for key, held in chosen.items() if held.folder}
@@ -71,7 +71,7 @@ def merge(
                     own = missing.get(result["id"])
                     if own is None or own != _held(place, result):
                         continue
-                    _copy_trace(store, joined, result["id"])
+                    _copy_trace(store, joined, result["id"], skipped)
                     joined.append(result)
                     del missing[result["id"]]
                     done(total - len(missing), total)
@@ -128,10 +128,26 @@ def _last(store: ResultStore, key: str) -> dict[str, Any]:
     return last
 
 
-def _copy_trace(source: ResultStore, target: ResultStore, case_id: str) -> None:
-    """Copy the trace of a case as it is, if there is one."""
+def _refuse_links(store: ResultStore) -> None:
+    """Refuse a folder with links: one of a stranger's could bring any file of ours into `out`.
+
+    Raises
+    ------
+    ValueError
+        In one line that names the link.
+    """
+    parts = [store.cases_file, store.folder / TRACES, *store.folder.glob("manifest*.json")]
+    for part in parts:
+        if part.is_symlink():
+            raise ValueError(f"{shortened(part)} is a link: merge takes no files from elsewhere")
+
+
+def _copy_trace(source: ResultStore, target: ResultStore, case_id: str, skipped: list[str]) -> None:
+    """Copy the trace of a case as it is, if there is one; a link is left out."""
     file = source.folder / TRACES / f"{case_id}.npz"
-    if file.is_file():
+    if file.is_symlink():
+        skipped.append(f"{shortened(file)}: is a link")
+    elif file.is_file():
         write_atomically(target.folder / TRACES / file.name, read_bytes(file, LARGEST_TRACE))
 
 

@@ -21,11 +21,12 @@ from experiments.run.foreign import opened_by
 from experiments.run.metrics import BANDS
 from experiments.run.provenance import changes_since, manifest_key
 from experiments.run.result_schema import read_case
+from experiments.run.store import BLOCK
 from experiments.run.tables import conditions_words, path_name
 from experiments.run.traffic import TrafficCase
 from experiments.run.worker_process import DIED, LATE
 from trajectories.arguments import shortened, shown
-from trajectories.fileio import parse_json
+from trajectories.fileio import opened, parse_json
 
 Result = Mapping[str, Any]
 Spec = Mapping[str, Any]
@@ -371,10 +372,11 @@ def origin_words(row: Row) -> str:
 
 def torn_line(file: Path) -> list[str]:
     """Return a line that names the incomplete last line of `cases.jsonl`, if there is one."""
-    with file.open("rb") as handle:
-        last, number = b"\n", 0
-        for number, last in enumerate(handle, start=1):  # noqa: B007
-            pass
+    last, number = b"\n", 0
+    with opened(file) as handle:
+        while part := handle.readline(BLOCK):
+            number += last.endswith(b"\n")
+            last = part
     if last.endswith(b"\n"):
         return []
     return [f"{file}, line {number}: is torn, as a run that was killed leaves it"]

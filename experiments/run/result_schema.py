@@ -27,8 +27,12 @@ Name = Annotated[str, Meta(max_length=1000)]
 Id = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9_-]{1,64}\Z")]
 """An id is part of a file's name."""
 Settings = dict[str, Any] | None
-CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
-"""Characters that a terminal takes for commands and HTML forbids, and halves of characters."""
+CONTROL = re.compile(
+    r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+"""Characters that a terminal takes for commands, that HTML forbids, or that turn the direction of
+the text around them, and halves of characters.
+"""
 LONGEST_LINE = 2**22
 """Longest line of `cases.jsonl` that is written and read, bytes."""
 

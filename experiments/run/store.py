@@ -253,6 +253,8 @@ class _Lines:
     """
 
     def __init__(self, file: Path) -> None:
+        if file.is_symlink():
+            raise ValueError(f"{file} is a link: results are written into {file.parent} only")
         # Unbuffered: the system has what is written, whatever becomes of this process.
         self._handle: BinaryIO = file.open("a+b", buffering=0)
         self._end = -1

@@ -156,6 +156,21 @@ def test_latex_is_a_table_of_equal_rows(
         assert row.count("$") % 2 == 0
 
 
+def test_no_name_is_a_formula_or_a_new_line(tmp_path: Path) -> None:
+    names = ['=HYPERLINK("x")', "@SUM(1)", "-1", "+1", "\n=1\n\nx"]
+    drives = [case(k, name) for k, name in enumerate(("stanley", *names))]
+    folder_of(tmp_path, drives, traces=False)
+    given = ["compare", str(tmp_path), "--baseline", "stanley", "--out", str(tmp_path)]
+    assert main([*given, "--metrics", "ale"]) == 0
+    with (tmp_path / "comparison.csv").open() as handle:
+        found = {row["competitor"] for row in csv.DictReader(handle)}
+    lines = {" ".join(name.split()) for name in names}
+    assert found == {f"'{line}" for line in lines}
+    table = (tmp_path / "comparison.tex").read_text().splitlines()
+    for line in lines:
+        assert rf"\multicolumn{{8}}{{l}}{{A: stanley, B: {escaped(line)}}} \\" in table
+
+
 def test_names_are_escaped() -> None:
     assert escaped("a_b & 50 % #1 {x} ~ ^ \\ $ m/s³ <") == (
         r"a\_b \& 50 \% \#1 \{x\} \textasciitilde{} \textasciicircum{} \textbackslash{} \$ "

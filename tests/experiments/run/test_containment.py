@@ -103,6 +103,14 @@ def test_traces_are_not_written_through_a_link(tmp_path: Path) -> None:
     assert list(elsewhere.iterdir()) == []
 
 
+def test_results_are_not_written_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine\nno newline")
+    (tmp_path / "cases.jsonl").symlink_to(tmp_path / "mine")
+    with pytest.raises(ValueError, match="is a link"):
+        ResultStore(tmp_path).append({"id": "x", "status": "ok", "agent": "a"})
+    assert (tmp_path / "mine").read_text() == "mine\nno newline"
+
+
 def test_workers_survive_what_ends_a_process_and_are_killed_in_native_code(tmp_path: Path) -> None:
     began = time.monotonic()
     found = swept(

@@ -168,3 +168,27 @@ def test_traces_are_kept_as_wanted(tmp_path: Path, kept: str, count: int) -> Non
         assert {(case["agent"], case["seed"]) for case in there} == {
             ("stanley", 0), ("pure-pursuit", 0),
         }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["cases.jsonl", "manifest.json", "traces"])
+@pytest.mark.parametrize("side", ["out", "in"])
+def test_folders_of_links_are_refused(tmp_path: Path, name: str, side: str) -> None:
+    made.folder_of(tmp_path / "out", [made.case(1)]).write_manifest({})
+    made.folder_of(tmp_path / "in", [made.case(2)]).write_manifest({})
+    mine = (tmp_path / side / name).rename(tmp_path / "mine")
+    (tmp_path / side / name).symlink_to(mine)
+    before = mine.read_bytes() if mine.is_file() else sorted(mine.iterdir())
+    with pytest.raises(ValueError, match=f"{name} is a link"):
+        merge(tmp_path / "out", [tmp_path / "in"])
+    assert before == (mine.read_bytes() if mine.is_file() else sorted(mine.iterdir()))
+
+
+def test_a_link_in_place_of_a_trace_brings_no_file_from_elsewhere(tmp_path: Path) -> None:
+    store = made.folder_of(tmp_path / "in", [made.case(1)], traces=False)
+    (tmp_path / "mine").write_text("secret")
+    (store.folder / "traces").mkdir()
+    trace = store.folder / "traces" / f"{made.case(1)['id']}.npz"
+    trace.symlink_to(tmp_path / "mine")
+    found = merge(tmp_path / "out", [store.folder])
+    assert (found.cases, found.skipped) == (1, [f"{trace}: is a link"])
+    assert not (tmp_path / "out" / "traces").exists()

@@ -30,8 +30,9 @@ from experiments.run.reproduction import (
     prepared,
     reproduce,
     sampled,
+    torn_line,
 )
-from experiments.run.store import ResultStore
+from experiments.run.store import BLOCK, ResultStore
 from experiments.run.traffic import TrafficCase
 from experiments.run.worker_process import DIED, late
 
@@ -154,6 +155,17 @@ def test_a_torn_line_and_a_damaged_one_are_named(folder: Path, again: Reproduce)
     assert code == 1
     assert f"damaged: {folder / 'cases.jsonl'}, line 2: is not JSON" in said
     assert "compared: 2 cases" in said
+
+
+def test_the_torn_line_is_found_whatever_its_length(tmp_path: Path) -> None:
+    file = tmp_path / "cases.jsonl"
+    long = b"x" * 3 * BLOCK
+    for content, number in ((b"", 0), (b"a\n", 0), (long + b"\n", 0), (b"a", 1), (b"a\nb", 2)):
+        file.write_bytes(content)
+        assert len(torn_line(file)) == (number > 0)
+        file.write_bytes(content + (b"\n" if number else b"") + long)
+        lines = content.count(b"\n") + (2 if number else 1)
+        assert torn_line(file)[0].startswith(f"{file}, line {lines}: is torn")
 
 
 def test_other_versions_are_named_and_met_within_a_tolerance(
