@@ -64,7 +64,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     if options.sample is not None:
         chosen = sampled(chosen, options.sample, options.seed)
     if not chosen:
-        raise ValueError(f"no result of {options.folder} can be run again")
+        where = "standard input" if options.folder == STDIN else options.folder
+        raise ValueError(f"no result of {where} can be run again")
     _print_origins(console, chosen)
     verdicts: list[Verdict] = []
     try:

@@ -37,8 +37,11 @@ PRINT: dict[str, Any] = {
 SUFFIXES = (".svg", ".pdf")
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)))
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
-NARROW, WIDE = 4.0, 50.0
-"""Ratios of the ends of an axis: a narrow one is linear, a wide one labelled at powers of ten."""
+NARROW, WIDE = 10.0, 100.0
+"""Ratios of the ends of an axis: a narrow one is linear, a wide one labelled at powers of ten.
+
+So that two labels at least fit on each: with fewer, Matplotlib chooses labels that overlap.
+"""
 LONGEST = 40
 """Characters of a name in a legend."""
 
@@ -66,7 +69,7 @@ def profiles(outcomes: Sequence[Outcome], width: str) -> Figure:
     keys = list(dict.fromkeys(one.measure.key for outcome in outcomes for one in outcome.metrics))
     columns = min(PANELS[width], len(keys))
     rows = math.ceil(len(keys) / columns)
-    figure = Figure(figsize=(WIDTHS[width], 0.35 + 1.25 * rows), layout="constrained")
+    figure = Figure(layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for panel in panels[len(keys) :]:
         panel.remove()
@@ -74,6 +77,8 @@ def profiles(outcomes: Sequence[Outcome], width: str) -> Figure:
         _profile(panel, outcomes, key)
         panel.set_ylabel("" if place % columns else "share of drives")
     handles, names = panels[0].get_legend_handles_labels()
+    lines = math.ceil(len(names) / columns)
+    figure.set_size_inches(WIDTHS[width], 0.2 + 0.15 * lines + 1.25 * rows)
     figure.legend(handles, names, loc="outside upper left", ncols=columns, frameon=False)
     return figure
 
@@ -109,8 +114,10 @@ def _profile(panel: "Axes", outcomes: Sequence[Outcome], key: str) -> None:
             for part in ("value", "low", "high")
         )
         colour = COLOURS[place % len(COLOURS)]
-        panel.plot(x, value, color=colour, linestyle=LINES[place % len(LINES)], label=name)
-        panel.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0.0)
+        panel.step(
+            x, value, where="post", color=colour, linestyle=LINES[place % len(LINES)], label=name
+        )
+        panel.fill_between(x, low, high, step="post", color=colour, alpha=0.15, linewidth=0.0)
     ratio = end / float(levels.min()) if levels.min() > 0.0 else 1.0
     if ratio > NARROW:
         panel.set_xscale("log")

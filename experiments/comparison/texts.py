@@ -57,12 +57,12 @@ class Line(NamedTuple):
 
 
 def number(value: float, decimals: int, *, sign: bool = False) -> str:
-    """Write a number; an interquartile mean is infinite where too many drives failed."""
+    """Write a number, zero without a minus; too many failures make interquartile means infinite."""
     if math.isnan(value):
         return "–"
     if math.isinf(value):
         return "failed"
-    return f"{value:{'+' if sign else ''}.{decimals}f}"
+    return f"{value:{'+' if sign else ''}z.{decimals}f}"
 
 
 def with_ends(interval: Interval, decimals: int, *, sign: bool = False) -> str:
@@ -75,8 +75,14 @@ def with_ends(interval: Interval, decimals: int, *, sign: bool = False) -> str:
 
 
 def decimals_of(metric: Metric) -> int:
-    """Return the decimals that show three digits of the means and two of the interval."""
-    scale = max(abs(metric.mean_a), abs(metric.mean_b))
+    """Return the decimals that show three digits of the means and two of the interval.
+
+    Without pairs that passed there are no means: then three digits of the interquartile means.
+    """
+    values = metric.mean_a, metric.mean_b
+    if math.isnan(metric.mean_a):
+        values = metric.iqm_a.value, metric.iqm_b.value
+    scale = max((abs(one) for one in values if math.isfinite(one)), default=math.nan)
     width = metric.difference.high - metric.difference.low
     wanted = [0]
     if math.isfinite(scale) and scale > 0.0:
@@ -168,8 +174,10 @@ def spreads(outcome: Outcome) -> Iterator[str]:
     """Yield, with several trainings, each metric's interval over drives and over trainings."""
     if max(outcome.trainings) == 1:
         return
-    yield "B - A apart: [over drives alone], [over trainings alone]"
-    for metric in outcome.metrics:
+    found = [one for one in outcome.metrics if math.isfinite(one.difference.value)]
+    if found:
+        yield "B - A apart: [over drives alone], [over trainings alone]"
+    for metric in found:
         digits = decimals_of(metric)
         ends = (
             f"[{number(one.low, digits)}, {number(one.high, digits)}]"

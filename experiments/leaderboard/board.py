@@ -53,8 +53,8 @@ NOTES = (
         "they are infinite (∞) where more than a quarter failed. Their 95 % intervals are "
         "bootstraps over drives as in lpv-track compare, stratified by path; agents with several "
         "trainings have a second one over trainings. Beside the drives that reached the end of "
-        "their path stands the Clopper-Pearson interval of the rate of failures. The times of "
-        "predict are the median over drives of each drive's median, and the largest 99th "
+        "their path stands the Clopper-Pearson interval of the rate of failures, with several "
+        "trainings the least and the most drives of one training. The times of predict are the median over drives of each drive's median, and the largest 99th "
         "percentile of a drive (p99), on the row's own machine."
     ),
     (
@@ -63,7 +63,8 @@ NOTES = (
         "the same; elsewhere values must agree within the tolerance of lpv-track reproduce. A "
         "row has no place if a case does not reproduce, or if an id does not fit the fields of "
         "its case. A sample proves nothing about the other cases: the commands below each table "
-        "run the same sample again, and without --id all cases."
+        "run the same sample again, and without --id all cases; for an agent that is a file add "
+        "--open-named-files, which executes that file."
     ),
 )
 FROM_OTHERS = (

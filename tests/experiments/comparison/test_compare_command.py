@@ -1,6 +1,7 @@
 """`lpv-track compare`: what it prints and writes, and how it refuses."""
 
 import csv
+import itertools
 import json
 import math
 import re
@@ -12,6 +13,7 @@ import pytest
 
 from experiments.cli import main
 from experiments.comparison.texts import decimals_of, escaped
+from experiments.comparison.texts import number as written
 from experiments.run.store import ResultStore
 from tests.helpers.compared_folders import folder, results
 from tests.helpers.made_results import METRICS, case, folder_of
@@ -293,3 +295,49 @@ def test_digits_follow_the_numbers(mine: Path) -> None:
     assert math.isclose(mle.mean_a, 0.2)
     assert decimals_of(mle) == 3
     assert decimals_of(ale) in (3, 4)
+    assert [written(-0.0, 0), written(-0.004, 2, sign=True)] == ["0", "+0.00"]
+
+
+def test_an_agent_that_never_passes_leaves_the_digits_of_the_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ends = (("lpv-nmpc", "finished"), ("stanley", "left_corridor"))
+    made = [
+        case(number, agent, path, {**WEIGHED, "ale": 0.0321}, end=end)
+        for number, (agent, end, path) in enumerate(
+            (agent, end, path) for agent, end in ends for path in ("T2", "T4")
+        )
+    ]
+    folder_of(tmp_path / "mine", made, traces=False)
+    assert compare(tmp_path / "mine", "--metrics", "ale", "--out", tmp_path / "out") == 0
+    (line,) = (one for one in capsys.readouterr().out.splitlines() if one.startswith(" ALE, m"))
+    assert line.split()[3:8] == ["–", "–", "–", "0.0321", "failed"]
+
+
+@pytest.mark.parametrize("high", [0.085, 0.16, 1.3])
+def test_labels_of_a_profile_do_not_overlap(tmp_path: Path, high: float) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    from experiments.comparison.competitors import pairs_within, read_folder
+    from experiments.comparison.figures import profiles
+    from experiments.comparison.measures import measure_of
+    from experiments.comparison.outcomes import compare as outcome_of
+
+    ends = (("lpv-nmpc", 0.014), ("stanley", high))
+    made = [case(k, agent, "T2", {"ale": ale}) for k, (agent, ale) in enumerate(ends)]
+    folder_of(tmp_path / "mine", made, traces=False)
+    found = read_folder(tmp_path / "mine", [measure_of("ale")], [])
+    (pair,) = pairs_within(found, [], None)
+    figure = profiles([outcome_of(*pair, found.drives, [measure_of("ale")], {})], "page")
+    figure.set_size_inches(1.8, 1.6)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    (panel,) = figure.axes
+    low, top = panel.get_xlim()
+    shown = [
+        label.get_window_extent()
+        for place, label in zip(panel.get_xticks(), panel.get_xticklabels(), strict=True)
+        if low <= place <= top and label.get_text()
+    ]
+    assert len(shown) >= 2
+    assert all(one.x1 < other.x0 for one, other in itertools.pairwise(shown))

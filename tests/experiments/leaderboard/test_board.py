@@ -187,6 +187,13 @@ def test_the_command_of_a_row_names_its_sample(tmp_path: Path) -> None:
     assert command_of(only(made)[0]) == f"lpv-track reproduce '{made}' --sample 5"
 
 
+def test_a_command_of_several_rows_is_written_once(tmp_path: Path) -> None:
+    made = folder(tmp_path / "mine", [*results(0.1), *results(0.2, "pid", 10)])
+    assert len(only(made)) == 2
+    text = markdown(board(made), "Board", "made", [])
+    assert text.count(f"lpv-track reproduce {made} --sample 5") == 1
+
+
 @pytest.mark.parametrize(
     ("suite", "number"),
     [("quick", 2), ("realtime", 60), ("paper", 78), ("learned", 346), ("converged", 18)],

@@ -452,7 +452,7 @@ def test_nothing_that_a_stranger_names_is_opened_or_run(
     ]
     code, said = paste("\n".join(map(json.dumps, rows)))
     assert code == 2
-    assert "no result of - can be run again" in said
+    assert "no result of standard input can be run again" in said
     assert (
         said.count("--open-named-files does, for results you trust") == len(rows) - 2
     )  # two have an agent, two a file in common
