@@ -54,8 +54,9 @@ NOTES = (
         "bootstraps over drives as in lpv-track compare, stratified by path; agents with several "
         "trainings have a second one over trainings. Beside the drives that reached the end of "
         "their path stands the Clopper-Pearson interval of the rate of failures, with several "
-        "trainings the least and the most drives of one training. The times of predict are the median over drives of each drive's median, and the largest 99th "
-        "percentile of a drive (p99), on the row's own machine."
+        "trainings the least and the most drives of one training. The times of predict are the "
+        "median over drives of each drive's median, and the largest 99th percentile of a drive "
+        "(p99), on the row's own machine."
     ),
     (
         "Rerun here: a sample of the row's cases was run again on the machine that made this "
