@@ -11,16 +11,9 @@ from typing import Any, NamedTuple
 from experiments.comparison.measures import Measure
 from experiments.run.regimes import passed
 from experiments.run.result_schema import read_case
+from experiments.run.settings import Setting, setting_of
 from experiments.run.store import ResultStore
-from experiments.run.tables import (
-    Setting,
-    drive_of,
-    label_of,
-    labels,
-    path_name,
-    setting_of,
-    training_of,
-)
+from experiments.run.tables import drive_of, label_of, labels, path_name, training_of
 from trajectories.arguments import shortened
 from trajectories.naming import choose
 

@@ -19,6 +19,7 @@ from experiments.run import regimes, suites
 from experiments.run.case import Case
 from experiments.run.resampling import Plan, plan_of
 from experiments.run.result_schema import read_driven
+from experiments.run.settings import setting_of
 from experiments.run.store import ResultStore
 from experiments.run.tables import (
     Result,
@@ -26,7 +27,6 @@ from experiments.run.tables import (
     current,
     drive_of,
     path_names,
-    setting_of,
     training_of,
     trainings,
 )

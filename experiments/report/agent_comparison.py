@@ -23,16 +23,8 @@ from experiments.run.console_tables import BAND_NOTE, Line, band_lines, band_ran
 from experiments.run.estimates import Estimate
 from experiments.run.excerpts import of_paths
 from experiments.run.metrics import BANDS, published_row
-from experiments.run.tables import (
-    EFFORT,
-    FURTHER,
-    SPREADS,
-    TRACKING,
-    Column,
-    Result,
-    Row,
-    Setting,
-)
+from experiments.run.settings import Setting, conditions_words, setting_of
+from experiments.run.tables import EFFORT, FURTHER, SPREADS, TRACKING, Column, Result, Row
 
 ERRORS = (
     ("ale", "ALE (m)", "Average lateral error"),
@@ -72,7 +64,7 @@ def _agent_figures(document: Document, cases: Sequence[Result], rows: Sequence[R
         return []
     family = main_family(done)
     conditions = {
-        tables.setting_of(case): tables.conditions_words(case.get("conditions", "simulation"))
+        setting_of(case): conditions_words(case.get("conditions", "simulation"))
         for case in done
         if family_of(case) == family
     }

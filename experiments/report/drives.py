@@ -13,8 +13,9 @@ from experiments.report.page import first_open, joined, paragraph
 from experiments.run import tables
 from experiments.run.excerpts import MOST_SETTINGS, first_and_worst
 from experiments.run.foreign import is_path_file
+from experiments.run.settings import Setting, conditions_words, setting_of
 from experiments.run.store import ResultStore
-from experiments.run.tables import Result, Setting
+from experiments.run.tables import Result
 from lpv_track_env import vehicle
 from lpv_track_env.bicycle import PSI, STATE_SIZE, X, Y
 from lpv_track_env.vehicle import VEHICLES, VehicleParameters
@@ -103,7 +104,7 @@ class Drive:
     @property
     def conditions(self) -> str:
         """Its conditions in words."""
-        return tables.conditions_words(self.case.get("conditions", "simulation"))
+        return conditions_words(self.case.get("conditions", "simulation"))
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ def drives_of(
         if case.get("status") != "ok" or len(drives) == MOST_DRIVES:
             continue
         label, path = tables.label_of(case), str(case.get("trajectory"))
-        setting = tables.setting_of(case)
+        setting = setting_of(case)
         key = setting, path, label
         if key in drives or path not in drawn[setting.family]:
             continue
@@ -193,7 +194,7 @@ def drawn_paths(cases: Iterable[Result]) -> dict[Setting, set[str]]:
 
 def family_of(case: Result) -> Setting:
     """Return the family of a case's setting, which is all of it but the conditions."""
-    return tables.setting_of(case).family
+    return setting_of(case).family
 
 
 def in_families(cases: Sequence[Result]) -> list[Result]:
@@ -231,7 +232,7 @@ def families(drives: Iterable[Drive]) -> list[Family]:
 
 def by_setting(drives: Iterable[Drive]) -> dict[Setting, list[Drive]]:
     """Group drives by setting, in order."""
-    return _grouped(drives, lambda drive: tables.setting_of(drive.case))
+    return _grouped(drives, lambda drive: setting_of(drive.case))
 
 
 def by_trajectory(drives: Iterable[Drive]) -> dict[str, list[Drive]]:

@@ -25,6 +25,7 @@ from experiments.report.page import (
 from experiments.report.svg_charts import Chart, around, decimate, exactly, spread
 from experiments.run import tables
 from experiments.run.excerpts import MOST_LISTED
+from experiments.run.settings import setting_of
 from experiments.run.tables import Result
 from lpv_track_env.bicycle import VX, VY, X, Y
 from lpv_track_env.vehicle import VehicleParameters
@@ -152,7 +153,7 @@ def _reached(cases: Iterable[Result], drives: Mapping[Any, Drive]) -> str:
             [
                 tables.case_name(case),
                 str(case.get("trajectory")),
-                str(tables.setting_of(case)),
+                str(setting_of(case)),
                 str(case.get("seed")),
                 f"{metrics.get('excess_lateral_velocity', 0.0):.3f}",
                 f"{100 * metrics.get('violated_lateral_velocity', 0.0):.1f}",

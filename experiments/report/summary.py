@@ -16,6 +16,7 @@ from experiments.run.console_tables import (
     over_seeds,
 )
 from experiments.run.excerpts import MOST_LISTED
+from experiments.run.settings import conditions_words, setting_of
 from experiments.run.statistics import rate_interval
 from experiments.run.tables import Result
 
@@ -144,7 +145,7 @@ def findings(cases: Sequence[Result]) -> list[Tile]:
     own = [case for case in done if family_of(case) == family and tables.label_of(case) == lead]
     by_conditions: dict[str, list[Result]] = {}
     for case in own:
-        words = tables.conditions_words(case.get("conditions", "simulation"))
+        words = conditions_words(case.get("conditions", "simulation"))
         words = f"{family.regime}, {words}" if family.regime else words
         by_conditions.setdefault(words, []).append(case)
     shown: list[Tile] = []
@@ -230,7 +231,7 @@ def failures_section(document: Document, cases: Sequence[Result]) -> str:
     failed = [
         [
             str(case["id"]), tables.case_name(case), str(case.get("trajectory")),
-            str(tables.setting_of(case)), str(case.get("seed")),
+            str(setting_of(case)), str(case.get("seed")),
             str(case.get("error", "no message")),
         ]
         for case in cases

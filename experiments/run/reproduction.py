@@ -21,8 +21,9 @@ from experiments.run.foreign import opened_by
 from experiments.run.metrics import BANDS
 from experiments.run.provenance import changes_since, manifest_key
 from experiments.run.result_schema import read_case
+from experiments.run.settings import conditions_words
 from experiments.run.store import BLOCK
-from experiments.run.tables import conditions_words, path_name
+from experiments.run.tables import path_name
 from experiments.run.traffic import TrafficCase
 from experiments.run.worker_process import DIED, LATE
 from trajectories.arguments import shortened, shown

@@ -10,19 +10,16 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import msgspec
+from typing import Any
 
 import agents
 import trajectories
 from experiments.run import suites
-from experiments.run.case import Case
 from experiments.run.estimates import Estimate, range_words, two_way
 from experiments.run.learning_cost import average, words
 from experiments.run.metrics import KEPT, PAPER_COLUMNS, published_row
+from experiments.run.settings import USUAL, Setting, changes_words, setting_of
 from experiments.run.training_folders import trained
 
 Result = Mapping[str, Any]
@@ -58,118 +55,6 @@ PUBLISHED_NOTE = (
     "with the vehicle. They are for orientation only, since its vehicle, weights and paths are not "
     "public."
 )
-LONGEST, CUT = 80, 48
-"""Most characters of a setting's value in a label, and those that are kept of a longer one."""
-
-
-class Setting(NamedTuple):
-    """Everything that cases of one table share: all of a case but agent, trajectory and seed.
-
-    Mappings are kept as JSON text, so that settings can be compared and be keys. Raw waypoints are
-    a setting of their own: averaged with drivable paths they would say nothing about either.
-    """
-
-    vehicle: str
-    vehicle_changes: str
-    speed_mode: str
-    fixed_speed: float | None
-    grip: float | None
-    raw: bool
-    conditions: str
-    computing: str
-    control_period: float
-    env_settings: str
-    regime: str = ""
-    start: str = "{}"
-    """Where a vehicle starts; a regime holds cases with many starts."""
-
-    @property
-    def family(self) -> "Setting":
-        """The setting under the default conditions: settings that differ only in these share it."""
-        return self._replace(conditions=DEFAULT.conditions)
-
-    @property
-    def departures(self) -> int:
-        """Number of entries that are not the default."""
-        return sum(own != usual for own, usual in zip(self, DEFAULT, strict=True))
-
-    def __str__(self) -> str:
-        """Title of the setting's tables."""
-        return _title(self)
-
-
-@lru_cache(maxsize=4096)
-def _title(setting: Setting) -> str:
-    parts = [setting.regime, setting.vehicle] if setting.regime else [setting.vehicle]
-    if changed := json.loads(setting.vehicle_changes):
-        parts.append(f"with {_changes(changed)}")
-    speed = "" if setting.fixed_speed is None else f" {setting.fixed_speed} m/s"
-    grip = None if setting.grip is None else f"{setting.grip} of grip"
-    parts.append(grip or f"{setting.speed_mode} speed{speed}")
-    if setting.raw:
-        parts.append("raw waypoints")
-    if setting.conditions != DEFAULT.conditions:
-        parts.append(f"conditions {conditions_words(json.loads(setting.conditions))}")
-    if computing := json.loads(setting.computing):
-        arrangement = computing.get("arrangement", "?")
-        parts.append(f"computing {arrangement} x {computing.get('load', 1):g}")
-    if setting.control_period != DEFAULT.control_period:
-        parts.append(f"control period {setting.control_period} s")
-    if changed := json.loads(setting.env_settings):
-        parts.append(f"env {_changes(changed)}")
-    if changed := json.loads(setting.start):
-        parts.append(f"start {_changes(changed)}")
-    return " · ".join(parts)
-
-
-def setting_of(case: Result) -> Setting:
-    """Return the setting of a case; entries that an old result lacks are the default."""
-
-    def text(name: str, default: Any) -> str:
-        value = case.get(name) or default
-        return msgspec.json.encode(value, order="sorted").decode() if value else "{}"
-
-    return Setting(
-        vehicle=str(case.get("vehicle", "?")),
-        vehicle_changes=text("vehicle_changes", {}),
-        speed_mode=str(case.get("speed_mode", "?")),
-        fixed_speed=case.get("fixed_speed"),
-        grip=case.get("grip"),
-        raw=str(case.get("trajectory")).endswith("-raw"),
-        conditions=text("conditions", Case.conditions),
-        computing=text("computing", {}),
-        control_period=case.get("control_period", Case.control_period),
-        env_settings=text("env_settings", {}),
-        regime=str(case.get("regime") or ""),
-        start="{}" if case.get("regime") else text("start", {}),
-    )
-
-
-USUAL = Case("", "").as_dict()
-DEFAULT = setting_of(USUAL)
-
-
-def _changes(values: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key}={_value_words(values[key])}" for key in sorted(values))
-
-
-def _value_words(value: Any) -> str:
-    """Return a setting's value in a line; a long one is cut, its digest keeping it apart."""
-    if isinstance(value, Mapping):
-        value = f"{{{_changes(value)}}}"
-    text = str(value)
-    if len(text) <= LONGEST:
-        return text
-    return f"{text[:CUT]}… #{hashlib.sha256(text.encode()).hexdigest()[:6]}"
-
-
-def conditions_words(given: str | Mapping[str, Any]) -> str:
-    """Return the name of conditions and the fields that depart from them."""
-    if isinstance(given, str):
-        return given
-    rest = {key: value for key, value in given.items() if key != "name"}
-    name = str(given.get("name", "ideal"))
-    return f"{name} with {_changes(rest)}" if rest else name
 
 
 @dataclass(frozen=True)
@@ -267,7 +152,7 @@ def label_of(case: Result) -> str:
     The trainings of a folder are one agent, see `training_folders.trained`.
     """
     agent, settings, _ = trained(case)
-    return f"{agent} ({_changes(settings)})" if settings else agent
+    return f"{agent} ({changes_words(settings)})" if settings else agent
 
 
 def trainings_of(cases: Iterable[Result]) -> int:

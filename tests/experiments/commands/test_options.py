@@ -10,6 +10,7 @@ from experiments.cli import main, parser
 from experiments.commands.options import agent_settings, speed_modes_of
 from experiments.run import tables
 from experiments.run.case import Case
+from experiments.run.settings import setting_of
 from experiments.run.store import ResultStore
 from experiments.run.suites import grid
 from trajectories import CurvatureBands
@@ -180,7 +181,7 @@ def test_shares_of_grip_are_driven_in_the_mode_of_that_name() -> None:
     assert [(spec["speed_mode"], spec.get("grip")) for spec in specs] == [
         ("variable", None), ("grip", 0.5), ("grip", 0.9),
     ]  # fmt: skip
-    titles = [str(tables.setting_of(Case(**spec).as_dict())) for spec in specs]
+    titles = [str(setting_of(Case(**spec).as_dict())) for spec in specs]
     assert titles == [
         "m2-minibus · variable speed", "m2-minibus · 0.5 of grip", "m2-minibus · 0.9 of grip",
     ]  # fmt: skip

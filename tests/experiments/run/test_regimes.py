@@ -8,7 +8,8 @@ from rich.console import Console
 
 from experiments.run import regimes
 from experiments.run.console_tables import screen
-from experiments.run.tables import current, setting_of
+from experiments.run.settings import setting_of
+from experiments.run.tables import current
 from tests.helpers.made_results import METRICS, case, folder_of, page
 
 RATES = {"steering_rate_rms": 0.1, "jerk_rms": 2.0, "rms_speed_error": 0.25}
