@@ -21,8 +21,8 @@ COMMANDS = {
     "benchmark": "Run agents x trajectories x seeds, print the paper's table, write report.html.",
     "reproduce": "Run cases of a results folder again, and compare every value bit for bit.",
     "report": "Rebuild the table and report.html from saved cases alone.",
-    "merge": "Join folders of results, such as the shards of one benchmark, in one.",
-    "leaderboard": "Build one page and Markdown of result folders; a sample of each row is rerun.",
+    "merge": "Join folders of results, such as the shards of one benchmark, into one.",
+    "leaderboard": "Rank results folders on one page and in Markdown; run a sample of each row again.",
     "compare": "Compare folders of results, or agents within one, drive by drive: table, LaTeX, "
     "figures.",
     "drive": "Watch a run live, or write its frames or a video; several agents side by side.",

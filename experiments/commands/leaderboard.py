@@ -1,4 +1,4 @@
-"""`lpv-track leaderboard`: one page and Markdown of result folders, a sample of each row rerun."""
+"""`lpv-track leaderboard`: results folders ranked on one page, a sample of each row run again."""
 
 import argparse
 import shlex

@@ -1,4 +1,4 @@
-"""`lpv-track merge`: folders of results, such as shards of one benchmark, joined in one."""
+"""`lpv-track merge`: folders of results, such as shards of one benchmark, joined into one."""
 
 import argparse
 
@@ -18,7 +18,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Join the folders, say how much there is, and return 0."""
+    """Join the folders, print the number of cases, and return 0."""
     from experiments.run.benchmark import progress_bar
     from experiments.run.merging import merge
 

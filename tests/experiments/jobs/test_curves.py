@@ -52,13 +52,17 @@ def test_a_missing_figure_is_the_worst_of_the_median() -> None:
     np.testing.assert_array_equal(median_of(values), [np.nan, 0.3, 0.2])
 
 
-def test_curves_of_one_and_of_several_seeds_are_drawn(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    figures: list[Any] = []
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Figures that a test draws, which are not saved."""
+    drawn: list[Any] = []
     monkeypatch.setattr(
-        "experiments.figures.save_figure", lambda figure, _file: figures.append(figure)
+        "experiments.figures.save_figure", lambda figure, _file: drawn.append(figure)
     )
+    return drawn
+
+
+def test_curves_of_one_and_of_several_seeds_are_drawn(tmp_path: Path, figures: list[Any]) -> None:
     early, late = line(NOTHING, best=True), line(HALF, 2000, best=True)
     draw({5: [early, late]}, TRAINING, "steps", tmp_path / "one.png")
     draw({0: [early, late], 1: [early], 2: [early, late]}, TRAINING, "steps", tmp_path / "all.png")
@@ -73,13 +77,7 @@ def test_curves_of_one_and_of_several_seeds_are_drawn(
     assert len(tuning.axes) == 1
 
 
-def test_nothing_finished_is_said_in_the_picture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    figures: list[Any] = []
-    monkeypatch.setattr(
-        "experiments.figures.save_figure", lambda figure, _file: figures.append(figure)
-    )
+def test_nothing_finished_is_said_in_the_picture(tmp_path: Path, figures: list[Any]) -> None:
     draw({0: [line(EARLIER, best=True)]}, TRAINING, "steps", tmp_path / "none.png")
     finished, ale, _ = figures[0].axes
     assert [text.get_text() for text in ale.texts] == ["no drive finished"]
