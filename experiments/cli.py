@@ -22,7 +22,7 @@ COMMANDS = {
     "reproduce": "Run cases of a results folder again, and compare every value bit for bit.",
     "report": "Rebuild the table and report.html from saved cases alone.",
     "merge": "Join folders of results, such as the shards of one benchmark, into one.",
-    "leaderboard": "Rank results folders on one page and in Markdown; run a sample of each row again.",
+    "leaderboard": "Rank folders of results on one page, and run a sample of each row again.",
     "compare": "Compare folders of results, or agents within one, drive by drive: table, LaTeX, "
     "figures.",
     "drive": "Watch a run live, or write its frames or a video; several agents side by side.",

@@ -93,7 +93,7 @@ class Worker:
         Raises
         ------
         BaseException
-            What the run raised.
+            The exception that the run raised.
         """
         try:
             if not self.pipe.poll():
