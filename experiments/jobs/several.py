@@ -112,10 +112,9 @@ def run_seeds(
     failed = _run(kind, left, engine, console)
     if runs := {spec["seed"]: lines for spec in specs if (lines := _lines(spec["folder"]))}:
         draw(runs, kind.curves, kind.budget, options.out / f"{kind.name}.png")
-    console.out(
-        f"{len(seeds) - failed} of {len(seeds)} {kind.name}s: {options.out} (lpv-track benchmark "
-        f"--agents {options.out})", highlight=False,
-    )  # fmt: skip
+    done = len(seeds) - failed
+    drive = f" (lpv-track benchmark --agents {options.out})" if done else ""
+    console.out(f"{done} of {len(seeds)} {kind.name}s: {options.out}{drive}", highlight=False)
     return failed
 
 

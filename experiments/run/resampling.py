@@ -91,10 +91,14 @@ def _words(strata: dict[tuple[str, Hashable], set[int]], paths: int, *, kept: bo
         least, most = min(seeds), max(seeds)
         number = f"{least}" if least == most else f"{least} to {most}"
         parts.append(
-            f"{number} seeds, stratified by path ({paths} paths; a seed is drawn for all it drives)"
+            f"{number} seeds, stratified by path ({paths} path{'s' * (paths != 1)}; a seed is "
+            "drawn for all it drives)"
         )
     if drives := sizes.get("path"):
-        parts.append(f"{sum(drives)} drives, each path's apart ({len(drives)} paths)")
+        parts.append(
+            f"{sum(drives)} drives, each path's apart "
+            f"({len(drives)} path{'s' * (len(drives) != 1)})"
+        )
     if alone := sizes.get("setting"):
         parts.append(
             f"{sum(alone)} drives that are alone on their path, each setting's apart "

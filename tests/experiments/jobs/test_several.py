@@ -127,6 +127,11 @@ def test_a_seed_that_fails_does_not_stop_the_others(
     assert "seed 0 failed: ValueError: " in text
     assert "2 of 3 tunings" in text
     assert (tmp_path / "seed-2" / "weights.json").is_file()
+    for seed in (1, 2):
+        (tmp_path / f"seed-{seed}" / "weights.json").unlink()
+        (tmp_path / f"seed-{seed}" / "search.json").write_text("{")
+    assert cli.main(tune(tmp_path, "--seeds", "0", "1", "2", "--resume")) == 1
+    assert "benchmark" not in capsys.readouterr().out  # there is nothing to drive with
 
 
 def test_ctrl_c_leaves_every_seed_resumable(

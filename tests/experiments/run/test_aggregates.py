@@ -135,6 +135,7 @@ def test_seeds_are_drawn_for_all_their_paths_at_once() -> None:
     assert plan.unit.tolist() == [0, 1, 2, 0, 1, 2]
     assert [units.tolist() for units in plan.strata] == [[0, 1, 2]]
     assert "3 seeds, stratified by path (2 paths" in plan.words
+    assert "stratified by path (1 path; a seed" in plan_of(cells[:3]).words
     # A path with other seeds is a stratum of its own.
     plan = plan_of([*cells, ("realtime", "T5", 7), ("realtime", "T5", 8)])
     assert [units.tolist() for units in plan.strata] == [[0, 1, 2], [3, 4]]
