@@ -64,9 +64,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
     made = [(section, board.entries_of(section, found, ids)) for section in sections]
     command = _command(options)
     page = board.page(made, options.title, f"made by {command}", skipped)
-    write_atomically(options.out / "index.html", page.encode())
+    write_atomically(options.out / "index.html", page.encode(errors="backslashreplace"))
     text = board.markdown(made, options.title, command, skipped)
-    write_atomically(options.out / "leaderboard.md", text.encode())
+    write_atomically(options.out / "leaderboard.md", text.encode(errors="backslashreplace"))
     refuted = [row for row in rows if found[row.key].refuted]
     for row in refuted:
         mark = found[row.key]

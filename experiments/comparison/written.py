@@ -24,8 +24,11 @@ def write(outcomes: Sequence[Outcome], folder: Path, width: str) -> list[str]:
     `width` is that of the figures, "column" or "page" (`experiments.comparison.figures.WIDTHS`).
     """
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / "comparison.csv", as_csv(outcomes).encode())
-    write_atomically(folder / "comparison.tex", latex(outcomes, comment(outcomes)).encode())
+    texts = {"csv": as_csv(outcomes), "tex": latex(outcomes, comment(outcomes))}
+    for suffix, text in texts.items():
+        # A folder's name may be no UTF-8.
+        content = text.encode(errors="backslashreplace")
+        write_atomically(folder / f"comparison.{suffix}", content)
     write_json(folder / "comparison.json", as_json(outcomes))
     names = ["comparison.csv", "comparison.tex", "comparison.json"]
     return [*names, *write_figures(outcomes, folder, width)]

@@ -301,7 +301,8 @@ def _commands(entries: Iterable[Entry]) -> str:
     """Return a block for each row: its command, and a case as the line that `reproduce -` reads."""
     blocks = []
     for entry in entries:
-        text = f"# {shortened(entry.row.label, LONGEST)}, {entry.row.name}\n{command_of(entry)}"
+        name = ", ".join(shortened(part, LONGEST) for part in _agent(entry.row))
+        text = f"# {name}\n{command_of(entry)}"
         if line := _line(entry):
             text += f"\n# or paste one of its cases:\nlpv-track reproduce -\n{line}"
         blocks.append(f'<pre tabindex="0">{html.escape(text)}</pre>')
@@ -323,12 +324,12 @@ def markdown(
     skipped: Sequence[str],
 ) -> str:
     """Return the board as Markdown, made by `command`."""
-    parts = [f"# {escaped(title)}", f"Made by `{command}`; do not edit."]
+    parts = [f"# {escaped(title)}", f"Made by {code(command)}; do not edit."]
     for section, entries in sections:
         parts.append(f"## {escaped(title_of(section))}, {len(section.drives)} drives")
         parts.append(_table(HEADINGS, map(cells, entries), NUMERIC))
         parts.append(_table(ORIGIN, map(origin, entries)))
-        commands = "\n".join(dict.fromkeys(map(command_of, entries)))
+        commands = "\n".join(dict.fromkeys(" ".join(command_of(one).split()) for one in entries))
         parts.append(f"These commands run a sample again:\n\n```sh\n{commands}\n```")
     parts.append("## How it is made")
     if skipped:
@@ -350,6 +351,13 @@ def _table(
     rows = [[cell(one, ", ") for one in headings], rule]
     rows += [[cell(one, "<br>") for one in line] for line in lines]
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def code(text: str) -> str:
+    """Return text as code within a line of Markdown, whatever backticks and line ends it holds."""
+    marks = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    space = " " * (len(marks) > 1)
+    return f"{marks}{space}{' '.join(text.split())}{space}{marks}"
 
 
 def escaped(text: str) -> str:

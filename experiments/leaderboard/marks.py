@@ -32,7 +32,7 @@ class Mark(NamedTuple):
 def sample(row: Row, number: int, seed: int) -> list[Result]:
     """Draw cases of a row, by its folder and agent, so that other rows do not change the draw."""
     cases = sorted(row.cases, key=lambda case: str(case["id"]))
-    digest = hashlib.sha256(f"{seed}\n{row.key}".encode()).digest()
+    digest = hashlib.sha256(f"{seed}\n{row.key}".encode(errors="backslashreplace")).digest()
     return random.Random(digest).sample(cases, min(number, len(cases)))  # noqa: S311
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from experiments.cli import main
-from experiments.leaderboard.board import entries_of, escaped, markdown, page
+from experiments.leaderboard.board import code, entries_of, escaped, markdown, page
 from experiments.leaderboard.rows import sections_of
 from experiments.run import ranking, resampling
 from tests.helpers.made_results import HOSTILE, case, folder_of, own_scripts_alone
@@ -140,6 +140,24 @@ def test_nothing_that_a_folder_names_is_opened_or_run(
     assert not ran.exists()
     text = (out / "leaderboard.md").read_text()
     assert text.count("--open-named-files") >= 5
+
+
+@pytest.mark.parametrize("name", ["a\n```\n# b", "a`<b>", "a\udcffb"])
+@pytest.mark.parametrize("command", ["leaderboard", "compare"])
+def test_a_folder_may_have_any_name(tmp_path: Path, name: str, command: str) -> None:
+    folder_of(tmp_path / name, [case(1), case(2, "pid")], traces=False)
+    more = {"leaderboard": ["--sample", "0"], "compare": ["--metrics", "ale"]}[command]
+    given = [command, str(tmp_path / name), *more, "--out", str(tmp_path / "out")]
+    assert main(given) == 0
+    for file in (tmp_path / "out").glob("*.[mct]*"):
+        text = file.read_text(encoding="utf-8")
+        assert "\n# b" not in text
+        assert text.count("\n```\n") == text.count("```sh\n")
+
+
+def test_code_stays_code_in_markdown() -> None:
+    assert code("a b\n\nc") == "`a b c`"
+    assert code("a`b``c") == "``` a`b``c ```"
 
 
 def test_text_stays_text_in_markdown() -> None:
