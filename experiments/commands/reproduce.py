@@ -188,10 +188,12 @@ def summary(verdicts: Iterable["Verdict"]) -> str:
             )
         if group:
             parts.append(f"{_count(len(group), 'case')}, {_count(values, 'value')} {way}")
+    if not parts:
+        return "compared: nothing"
     different = [verdict for verdict in compared if verdict.differences]
     lines = sum(len(verdict.differences) for verdict in different)
     end = f"{_count(lines, 'difference')} in {_count(len(different), 'case')}" if lines else "equal"
-    return f"compared: {' and '.join(parts) or 'nothing'}: {end}"
+    return f"compared: {' and '.join(parts)}: {end}"
 
 
 def _count(number: int, word: str) -> str:

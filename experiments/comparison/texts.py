@@ -28,8 +28,9 @@ NOTE = (
     "↓ less is better, ↑ more is better; B - A is positive where B has more. Means and B - A are "
     "over pairs of drives that both passed. All else is over all drives, a failed one being behind "
     "every other: the interquartile mean (IQM), the probability that B is better than A in a "
-    "random drive of each on the same path, and the drives that B wins. Speed error, steering "
-    "rate and jerk are root mean squares. Definitions: Agarwal et al., NeurIPS 2021."
+    "random drive of each on the same path, every path of a setting counting alike, and the drives "
+    "that B wins. Speed error, steering rate and jerk are root mean squares. Definitions: Agarwal "
+    "et al., NeurIPS 2021."
 )
 GAP_NOTE = "Optimality gap: 1 - mean(min(1, target / metric)); 0 is the best, a failed drive has 1."
 SHOWN = 3

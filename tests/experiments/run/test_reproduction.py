@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from experiments.cli import main
+from experiments.commands.reproduce import summary
 from experiments.run import provenance
 from experiments.run.benchmark import run_benchmark
 from experiments.run.case import Case, run_case
@@ -305,6 +306,10 @@ def test_ctrl_c_says_how_far_it_came(
         "interrupted: 1 of 3 cases were run again; --sample N draws fewer\ncompared: 1 case, "
         in said
     )
+
+
+def test_without_a_comparison_nothing_is_called_equal() -> None:
+    assert summary([]) == "compared: nothing"
 
 
 def test_a_case_of_two_results_is_run_once(folder: Path) -> None:
