@@ -98,8 +98,19 @@ def _chosen(stores: Sequence[ResultStore], skipped: list[str]) -> dict[str, Held
 
 
 def _held(place: int, result: Mapping[str, Any]) -> Held:
-    content = repr(sorted(_compared(result).items())).encode()
+    content = repr(_canonical(_compared(result))).encode()
     return Held(place, result["status"], hashlib.blake2b(content, digest_size=16).digest())
+
+
+def _canonical(value: Any) -> Any:
+    """Return plain JSON in a form whose text is the same for equal values, such as 1 and 1.0."""
+    if isinstance(value, Mapping):
+        return sorted((key, _canonical(inner)) for key, inner in value.items())
+    if isinstance(value, list | tuple):
+        return [_canonical(inner) for inner in value]
+    if isinstance(value, int | float) and float(value) == value:
+        return float(value) + 0.0  # -0.0 is 0.0
+    return value
 
 
 def _compared(result: Mapping[str, Any]) -> dict[str, Any]:

@@ -192,3 +192,16 @@ def test_a_link_in_place_of_a_trace_brings_no_file_from_elsewhere(tmp_path: Path
     found = merge(tmp_path / "out", [store.folder])
     assert (found.cases, found.skipped) == (1, [f"{trace}: is a link"])
     assert not (tmp_path / "out" / "traces").exists()
+
+
+def test_many_numbers_that_are_written_otherwise_are_compared_in_one_pass(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pass over both folders for each of them would take days for a hundred thousand cases."""
+    for name, value, zero in (("a", 1.0, 0.0), ("b", 1, -0.0)):
+        cases = [
+            made.case(k, metrics={"mle": value, "aoe": zero}, fixed_speed=value) for k in range(3)
+        ]
+        made.folder_of(tmp_path / name, cases, traces=False)
+    monkeypatch.setattr("experiments.run.merging._refuse", None)
+    assert merge(tmp_path / "all", [tmp_path / "a", tmp_path / "b"]).cases == 3
