@@ -72,6 +72,8 @@ def agent_class(name: str) -> Callable[..., Any]:
                 f"agent {shown(name)} is a folder: give one policy file in it, such as "
                 "seed-0/policy.json; lpv-track benchmark alone takes a folder of trainings"
             )
+        if "/" in name or os.sep in name:
+            raise ValueError(f"agent {shown(name)}: there is no such folder of trainings")
         raise ValueError(
             f"unknown agent {shown(name)}; {suggestion(name, REGISTRY)}, "
             "or give your own as file.py:Class or module:Class, a learned policy as its .json"

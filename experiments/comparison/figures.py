@@ -42,6 +42,8 @@ NARROW, WIDE = 10.0, 100.0
 
 So that two labels at least fit on each: with fewer, Matplotlib chooses labels that overlap.
 """
+MOST_LINEAR, LINEAR = 200.0, 10.0
+"""Relative difference beyond which their axis is logarithmic, and its linear part at 0, %."""
 LONGEST = 40
 """Characters of a name in a legend."""
 
@@ -138,6 +140,10 @@ def differences(outcomes: Sequence[Outcome], width: str) -> Figure:
 
     figure, panel = _forest(outcomes, width, percent, 0.0)
     panel.set_xlabel("difference to the baseline, % of its mean")
+    if max(map(abs, panel.get_xlim())) > MOST_LINEAR:
+        # One hopeless competitor would press all others onto the line at 0.
+        panel.set_xscale("symlog", linthresh=LINEAR)
+        panel.xaxis.set_major_formatter("{x:g}")
     return figure
 
 
@@ -177,6 +183,8 @@ def _forest(
                 markeredgewidth=0.0, label=label,
             )  # fmt: skip
             label = ""
+        if label:
+            panel.plot([], [], " ", label=f"{label}: no drive passed by both")
     panel.set_yticks(range(len(measures)), [f"{m.heading} {m.better}" for m in measures.values()])
     panel.set_ylim(len(measures) - 0.5, -0.5)
     panel.grid(visible=False, axis="y")

@@ -7,6 +7,7 @@ elsewhere numbers are compared with a tolerance.
 import json
 import os
 import random
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -14,6 +15,7 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
+from agents.registry import agent_class
 from experiments.run.case import BaseCase, Case, failed_case, run_case
 from experiments.run.engines import Engine
 from experiments.run.exact import OUTCOMES, values_of
@@ -40,6 +42,7 @@ relative difference of a metric by more than the absolute tolerance (SI units) w
 2,000 drives, of the suites `quick` (20), `realtime` (240 of four agents) and `limits` (1,740 of
 three), and 7e-4 in one, of the NMPC at the limit of friction.
 """
+WORD = re.compile(r"[\w-]+")
 ALTERED = "its fields or files were changed after it was driven"
 MEASURED = "delays are measured on the machine and differ from run to run"
 SAME: Mapping[str, Sequence[str]] = {"versions": (), "sources": (), "processor": ()}
@@ -193,6 +196,8 @@ def prepared(
 
 def _case_to_run(result: Result, open_named_files: bool) -> BaseCase:
     named = opened_by(result)
+    if named[:1] == [result.get("agent")] and WORD.fullmatch(named[0]):
+        agent_class(named[0])  # no file or module, but a name that is not known
     if named and not open_named_files:
         raise NotRunError(
             f"to run it again would open or execute {shown(named[0])}: --open-named-files does, "

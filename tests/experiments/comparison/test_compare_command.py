@@ -341,3 +341,30 @@ def test_labels_of_a_profile_do_not_overlap(tmp_path: Path, high: float) -> None
     ]
     assert len(shown) >= 2
     assert all(one.x1 < other.x0 for one, other in itertools.pairwise(shown))
+
+
+def test_a_hopeless_competitor_leaves_the_others_legible(tmp_path: Path) -> None:
+    from experiments.comparison.competitors import pairs_within, read_folder
+    from experiments.comparison.figures import differences
+    from experiments.comparison.measures import measure_of
+    from experiments.comparison.outcomes import compare as outcome_of
+
+    drives = (("lpv-nmpc", 0.01, "finished"), ("stanley", 0.2, "finished"),
+              ("lqr", 0.011, "finished"), ("pid", 0.01, "left_corridor"))  # fmt: skip
+    made = [
+        case(k, agent, "T2", {"ale": ale}, end=end) for k, (agent, ale, end) in enumerate(drives)
+    ]
+    folder_of(tmp_path / "mine", made, traces=False)
+    measures = [measure_of("ale")]
+    found = read_folder(tmp_path / "mine", measures, [])
+    outcomes = [
+        outcome_of(*pair, found.drives, measures, {}) for pair in pairs_within(found, [], None)
+    ]
+    figure = differences(outcomes, "page")
+    (panel,) = figure.axes
+    # 1900 % and 10 % stand on one axis, and pid is named though it has nothing to show.
+    assert panel.get_xscale() == "symlog"
+    (names,) = ([text.get_text() for text in legend.get_texts()] for legend in figure.legends)
+    assert "pid against lpv-nmpc: no drive passed by both" in names
+    near = differences([one for one in outcomes if one.b.label == "lqr"], "page")
+    assert near.axes[0].get_xscale() == "linear"

@@ -402,6 +402,10 @@ def test_a_case_that_cannot_be_run_says_why(paste: Reproduce) -> None:
         ('{"agent": "pid\\u001b[2J"}', "holds characters that cannot be printed"),
         ("[" * 100_000, "nested too deeply"),
         ('{"agent": "stanley", "end": "finished"}', "the result names no trajectory"),
+        (
+            '{"agent": "stanly", "end": "finished"}',
+            "unknown agent 'stanly'",
+        ),
         ('{"trajectory": "T2", "end": "finished"}', "the result names no agent"),
         ('{"agent": "stanley", "trajectory": "T2"}', "holds no value to compare"),
         (

@@ -213,6 +213,13 @@ def test_a_folder_that_is_no_agent_is_refused_in_a_line(tmp_path, files, capsys)
     assert "seed-N/weights.json" in line
 
 
+def test_a_folder_that_is_not_there_is_named(tmp_path, capsys):
+    words = ["benchmark", "--agents", "results/pop", "--out", str(tmp_path / "out")]
+    assert cli.main(words) == 2
+    message = "lpv-track: agent 'results/pop': there is no such folder of trainings\n"
+    assert capsys.readouterr().err == message
+
+
 @pytest.mark.parametrize("words", [["drive", "--frames", "f"], ["ablation"], ["highway"]])
 def test_other_commands_take_one_policy_file(tmp_path, words, capsys):
     pytest.importorskip("highway_env")
