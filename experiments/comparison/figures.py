@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import matplotlib as mpl
 import numpy as np
@@ -48,6 +48,15 @@ LONGEST = 40
 """Characters of a name in a legend."""
 
 
+class _Curve(NamedTuple):
+    """Curve of a performance profile; all figures draw a competitor in the same colour."""
+
+    name: str
+    colour: int
+    metric: Metric
+    shares: list[Interval]
+
+
 def write_figures(outcomes: Sequence[Outcome], folder: Path, width: str) -> list[str]:
     """Write performance profiles, differences and probabilities of improvement; return names.
 
@@ -88,19 +97,24 @@ def profiles(outcomes: Sequence[Outcome], width: str) -> Figure:
 def _profile(panel: "Axes", outcomes: Sequence[Outcome], key: str) -> None:
     """Draw the curves of a metric: one of each baseline, then one of each competitor."""
     found = [
-        (outcome, one) for outcome in outcomes for one in outcome.metrics if one.measure.key == key
+        (place, outcome, one)
+        for place, outcome in enumerate(outcomes)
+        for one in outcome.metrics
+        if one.measure.key == key
     ]
-    curves: dict[Any, tuple[str, Metric, list[Interval]]] = {}
-    for outcome, one in found:
-        # A baseline has another curve where it meets others on other drives.
+    # A baseline has another curve where it meets others on other drives.
+    bases = {(outcome.a.label, tuple(outcome.drives)) for outcome in outcomes}
+    baselines: dict[Any, _Curve] = {}
+    competitors = []
+    for place, outcome, one in found:
+        own, other = _names(outcome)
+        if len(bases) > len({label for label, _ in bases}):
+            own = f"{own}, {len(outcome.drives)} drives"
         basis = outcome.a.folder, outcome.a.label, tuple(outcome.drives)
-        curves.setdefault(basis, (_names(outcome)[0], one, one.profile.a))
-    for outcome, one in found:
-        curves[outcome.b.folder, outcome.b.label, outcome.a.label] = (
-            _names(outcome)[1], one, one.profile.b
-        )  # fmt: skip
-    measure = found[0][1].measure
-    levels = np.concatenate([one.profile.levels for _, one in found])
+        baselines.setdefault(basis, _Curve(own, 0, one, one.profile.a))
+        competitors.append(_Curve(other, place + 1, one, one.profile.b))
+    measure = found[0][2].measure
+    levels = np.concatenate([one.profile.levels for *_, one in found])
     relation = "≤" if measure.sign > 0.0 else "≥"
     unit = f" {measure.unit}" if measure.unit else ""
     panel.set_xlabel(f"{measure.heading} {relation} x{unit}")
@@ -109,13 +123,14 @@ def _profile(panel: "Axes", outcomes: Sequence[Outcome], key: str) -> None:
         return
     # The axis runs towards worse values also where more is better.
     end = float(levels.max())
-    for place, (name, one, shares) in enumerate(curves.values()):
+    curves = [*baselines.values(), *competitors]
+    for place, (name, colour_place, one, shares) in enumerate(curves):
         x = measure.sign * np.append(one.profile.levels, end)
         value, low, high = (
             np.array([getattr(share, part) for share in (*shares, shares[-1])])
             for part in ("value", "low", "high")
         )
-        colour = COLOURS[place % len(COLOURS)]
+        colour = COLOURS[colour_place % len(COLOURS)]
         panel.step(
             x, value, where="post", color=colour, linestyle=LINES[place % len(LINES)], label=name
         )
