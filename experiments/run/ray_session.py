@@ -18,7 +18,9 @@ QUIET = {
 }
 """Environment that keeps Ray's own messages off the screen, and GPUs visible."""
 LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
-"""Environment of a Ray that only this computer reaches."""
+"""Environment of a Ray that only this computer reaches; else Ray takes 127.0.0.1 for another."""
+OWN = ("127.0.0.1", "localhost", "[::1]")
+"""Names of this computer in an address."""
 STORE = 2**29
 """Memory for objects of a local Ray, bytes; more goes to disk."""
 
@@ -43,7 +45,8 @@ def connected(workers: int | None, address: str | None) -> Iterator[None]:
     ValueError
         If there is no Ray at the address, or none can be started.
     """
-    wanted = QUIET | LOOPBACK if address is None else QUIET
+    own = address is None or address.rpartition(":")[0] in OWN
+    wanted = QUIET | LOOPBACK if own else QUIET
     os.environ.update({key: value for key, value in wanted.items() if key not in os.environ})
     try:
         import ray

@@ -179,3 +179,5 @@ def _begin_worker() -> None:
         fcntl.fcntl(sentinel, fcntl.F_SETOWN, os.getpid())
         flags = fcntl.fcntl(sentinel, fcntl.F_GETFL)
         fcntl.fcntl(sentinel, fcntl.F_SETFL, flags | os.O_ASYNC)
+        if wait_for([sentinel], 0):  # closed before the system was asked to tell
+            os._exit(1)

@@ -39,6 +39,8 @@ WORDS = ["benchmark", "--agents", "stanley", "pid", "--trajectories", "u-turn", 
 PRINTED = r"^\[(\d+)/"
 LONG = ["benchmark", "--agents", "lpv-nmpc", "--trajectories", "T5", "T6"]
 """Cases of a second and more: drives of four minutes."""
+PATIENCE = 300.0
+"""Longest wait for the first case of a sweep, s."""
 
 
 def job(*words: str) -> Job:
@@ -62,7 +64,10 @@ class Campaign:
     def _wait_for_a_case(self, running: Running) -> None:
         """Wait until the sweep has stored a case."""
         file = running.folder / "cases.jsonl"
+        until = time.monotonic() + PATIENCE
         while running.process.is_alive() and not (file.exists() and file.stat().st_size):
+            if time.monotonic() > until:
+                raise RuntimeError(f"no case after {PATIENCE:g} s: {running.folder}")
             time.sleep(0.005)
 
     def _whole(self) -> tuple[tuple[float, float], Facts]:
