@@ -42,7 +42,7 @@ def test_ablation(
     assert rows["all, perfect sensors", True]["rms_estimate_error"] == 0.0
     assert rows["all: realtime", True]["rms_estimate_error"] > 0.01
     assert rows["all: realtime", True]["ale"] > rows["none", True]["ale"]
-    assert result["revision"].keys() == {"commit", "modified"}
+    assert result["revision"].keys() == {"sources", "commit", "modified"}
     for label in labels:
         assert label.split(",")[0] in shown
     assert mpimg.imread(tmp_path / "ablation.png").std() > 0.05

@@ -207,7 +207,7 @@ def test_sigterm_brakes_first_and_ends_all(tmp_path: Path) -> None:
     result = json.loads((tmp_path / "run.json").read_text())
     assert result["run"]["end"] == "SIGTERM"
     assert result["run"]["stop"]["final_speed"] < 0.02
-    assert result["machine"]["revision"].keys() == {"commit", "modified"}
+    assert result["machine"]["revision"].keys() == {"sources", "commit", "modified"}
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
 
 

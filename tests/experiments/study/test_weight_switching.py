@@ -258,7 +258,7 @@ def test_switching(
     assert result["setup"]["episodes"] == 2
     assert len(result["trajectories"]) == 40
     assert result["trajectories"][:3] == ["random-0", "random-fast-1", "random-2"]
-    assert result["revision"].keys() == {"commit", "modified"}
+    assert result["revision"].keys() == {"sources", "commit", "modified"}
     for label, row in result["arms"].items():
         assert row["episodes"] == 2
         assert label in shown
