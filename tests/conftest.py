@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from experiments.run.ray_session import LOOPBACK, QUIET
+
 SLOW = (
     "agents/nmpc/test_f", "agents/nmpc/test_lin", "agents/nmpc/test_nmpc", "agents/nmpc/test_qp",
     "agents/nmpc/test_rti",
@@ -32,6 +34,8 @@ SLOW = (
 
 def pytest_configure() -> None:
     os.environ["LPV_TRACK_CACHE"] = "off"  # nothing of the tests is left in the user's cache
+    # Ray reads them when it is imported, which a learning library may do before anybody else.
+    os.environ.update(QUIET | LOOPBACK)
     # Whoever is started in the background ignores Ctrl-C, and so do the processes it starts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

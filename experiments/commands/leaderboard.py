@@ -45,7 +45,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     if not rows:
         raise ValueError(skipped[1] if len(skipped) > 1 else skipped[0])
     for line in skipped[:MOST_LINES]:
-        console.print(f"left out: {line}", markup=False, style="red")
+        console.out(f"left out: {line}", style="red", highlight=False)
     if len(skipped) > MOST_LINES:
         console.print(f"left out: {len(skipped) - MOST_LINES} more lines", style="red")
     options.out.mkdir(parents=True, exist_ok=True)

@@ -29,7 +29,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
             lambda done, total: progress.update(bar, completed=done, total=total),
         )  # fmt: skip
     for line in found.skipped:
-        console.print(f"left out: {line}", markup=False, style="red")
+        console.out(f"left out: {line}", style="red", highlight=False)
     console.out(
         f"{found.cases} cases in {options.out}, {found.added} of them added from "
         f"{len(options.folders)} folder{'s' * (len(options.folders) > 1)}; tables and report: "

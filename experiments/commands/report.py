@@ -33,6 +33,6 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = write_report(options.folder, files)
     console.print(all_tables(ResultStore(options.folder).cases(skipped, read_driven)))
     for line in skipped:
-        console.print(f"left out: {line}", markup=False, style="red")
+        console.out(f"left out: {line}", style="red", highlight=False)
     console.out(where(report), highlight=False)
     return 0

@@ -25,7 +25,7 @@ SHORT = {
 NEEDS = {
     "train_ppo": "stable_baselines3", "highway_traffic": "highway_env",
     "cleanrl_style_ppo": "torch", "torchrl_ppo": "torchrl", "skrl_ppo": "skrl",
-    "tianshou_ppo": "tianshou", "rllib_ppo": "ray", "dompc_agent": "do_mpc",
+    "tianshou_ppo": "tianshou", "rllib_ppo": "tree", "dompc_agent": "do_mpc",
 }  # fmt: skip
 """Modules without which an example is skipped; Tianshou and Ray want environments of their own."""
 """Arguments that make an example short; the others are short as they are."""

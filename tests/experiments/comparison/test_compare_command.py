@@ -4,6 +4,7 @@ import csv
 import itertools
 import json
 import math
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,13 @@ def mine(tmp_path: Path) -> Path:
         )
     ]  # fmt: skip
     folder_of(tmp_path / "mine_&_yours", made, traces=False)
-    return tmp_path / "mine_&_yours"
+    return Path("mine_&_yours")
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Name folders as seen from this one: long names break the lines of a terminal."""
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture
@@ -48,7 +55,8 @@ def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def compare(*arguments: object) -> int:
-    return main(["compare", *map(str, arguments)])
+    words = [os.path.relpath(one) if isinstance(one, Path) else str(one) for one in arguments]
+    return main(["compare", *words])
 
 
 @pytest.mark.usefixtures("without_figures")
@@ -70,9 +78,8 @@ def test_the_table_says_what_a_b_and_the_signs_are(
     assert "0/0/10" in line
     # Every metric keeps to its line.
     assert sum("↓" in line or "↑" in line for line in said.splitlines()[:20]) == 8
-    again = tmp_path / "again"
-    assert compare(mine, "--out", again, "--target", "ale=0.1") == 0
-    assert capsys.readouterr().out.replace(str(again), str(tmp_path / "out")) == said
+    assert compare(mine, "--out", tmp_path / "again", "--target", "ale=0.1") == 0
+    assert capsys.readouterr().out.replace("in again:", "in out:") == said
 
 
 @pytest.mark.usefixtures("without_figures")
@@ -187,7 +194,7 @@ def test_folders_of_namesakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     folder(tmp_path / "b", ("stanley", {"T2": [0.2, 0.3, 0.4, 0.5]}), ("lqr", errors))
     assert compare(tmp_path / "a", tmp_path / "b", "--out", tmp_path / "out") == 0
     said = capsys.readouterr().out
-    assert f"B  stanley in {tmp_path / 'b'}" in said
+    assert "B  stanley in b\n" in said
     assert "left out, 1 drive that B alone has: T2 seed 3" in said
     assert "pid" not in said
     (line,) = (line for line in said.splitlines() if line.startswith(" ALE"))
@@ -262,7 +269,7 @@ def test_a_folder_without_results_is_refused(
     mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert compare(mine, tmp_path / "none", "--out", tmp_path / "out") == 2
-    assert f"no results in {tmp_path / 'none'}" in capsys.readouterr().err
+    assert "no results in none\n" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
 
 
