@@ -33,7 +33,9 @@ def cluster(nodes: int = 2, **more: str) -> Iterator[Any]:
 
 def node(cpus: int, **more: str) -> dict[str, Any]:
     """Arguments of a node of a cluster; `more` are environment variables."""
-    return {"num_cpus": cpus, "object_store_memory": STORE, "env_vars": more or None}
+    # Ray's workers do not know where pytest found the functions of tests.
+    variables = {"PYTHONPATH": str(Path(__file__).parents[2]), **more}
+    return {"num_cpus": cpus, "object_store_memory": STORE, "env_vars": variables}
 
 
 def kill_node(one: Any) -> None:
