@@ -34,6 +34,7 @@ SLOW = (
 
 def pytest_configure() -> None:
     os.environ["LPV_TRACK_CACHE"] = "off"  # nothing of the tests is left in the user's cache
+    os.environ.pop("COLUMNS", None)  # processes of pytest-xdist have 80, a pipe has 120
     # Ray reads them when it is imported, which a learning library may do before anybody else.
     os.environ.update(QUIET | LOOPBACK)
     # Whoever is started in the background ignores Ctrl-C, and so do the processes it starts.
