@@ -120,7 +120,7 @@ def _results(
 def _run(
     options: argparse.Namespace, console: Console, rows: Sequence["Row"], verdicts: list["Verdict"]
 ) -> None:
-    from experiments.run.benchmark import CASE_LIMIT, STEPS, label, progress_bar
+    from experiments.run.benchmark import CASE_LIMIT, label, line_due, progress_bar
     from experiments.run.engines import Interrupts
     from experiments.run.reproduction import reproduce
 
@@ -137,9 +137,7 @@ def _run(
             _print_verdict(console, verdict)
             progress.advance(bar)
             done = len(verdicts)
-            # Piped: a line every 5 % of the cases.
-            shares = {STEPS * count // len(rows) for count in (done - 1, done)}
-            if not console.is_terminal and len(shares) > 1:
+            if line_due(console, done, len(rows)):
                 elapsed = time.perf_counter() - began
                 _print(console, f"[{done}/{len(rows)}, {elapsed:.0f} s] {verdict.row.words}")
 

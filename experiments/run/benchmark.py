@@ -216,6 +216,11 @@ def progress_bar(console: Console) -> Progress:
     )
 
 
+def line_due(console: Console, done: int, total: int) -> bool:
+    """Return whether a line of progress is due: every 5 % where the console is no terminal."""
+    return not console.is_terminal and STEPS * done // total > STEPS * (done - 1) // total
+
+
 def _run(
     specs: Sequence[Spec], kind: type[BaseCase], store: ResultStore, engine: Engine,
     console: Console, limit: float, drawn: Container[str] | None,
@@ -240,9 +245,7 @@ def _run(
             kept = drawn is None or result["id"] in drawn
             store.append(result if kept else {**result, "trace": {}})
             progress.advance(bar)
-            # Piped: a line every 5 % of the cases.
-            shares = (STEPS * done // len(specs) for done in (count - 1, count))
-            if not console.is_terminal and len(set(shares)) > 1:
+            if line_due(console, count, len(specs)):
                 elapsed = time.perf_counter() - began
                 console.print(
                     f"[{count}/{len(specs)}, {elapsed:.0f} s] {label(result)}: "

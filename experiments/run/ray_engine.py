@@ -97,10 +97,10 @@ class _Task:
 
 
 @dataclass(eq=False)
-class _Hand:
+class _Actor:
     """An actor and its state: it says hello, is idle, or runs the spec of a number."""
 
-    actor: Any
+    handle: Any
     at: Any
     """Reference to the answer that it owes; None if it is idle."""
     node: str | None = None
@@ -139,7 +139,7 @@ class _Sweep:
         """Specs that run alone on a computer: one of them may bring a worker down."""
         self._deaths: Counter[int] = Counter()
         self._losses: Counter[int] = Counter()
-        self._hands: list[_Hand] = []
+        self._actors: list[_Actor] = []
         self._again: set[int] = set()
         """Specs that have started before, and wait again."""
         self._refused: dict[str, str] = {}
@@ -152,8 +152,8 @@ class _Sweep:
         """Contents of files on the cluster, by digest."""
 
     @property
-    def _busy(self) -> list[_Hand]:
-        return [hand for hand in self._hands if hand.number is not None]
+    def _busy(self) -> list[_Actor]:
+        return [actor for actor in self._actors if actor.number is not None]
 
     @property
     def unfinished(self) -> bool:
@@ -168,8 +168,8 @@ class _Sweep:
             self._say_waiting()
             self._looked = time.monotonic()
         self._assign()
-        waiting = {hand.at: hand for hand in self._hands if hand.at is not None}
-        copies = {hand.copy: hand for hand in self._hands if hand.copy is not None}
+        waiting = {actor.at: actor for actor in self._actors if actor.at is not None}
+        copies = {actor.copy: actor for actor in self._actors if actor.copy is not None}
         everything = [*copies, *waiting]
         if not everything:
             time.sleep(TURN)
@@ -201,40 +201,40 @@ class _Sweep:
         options: dict[str, Any] = {"scheduling_strategy": "SPREAD"}
         if self._refused:
             options["label_selector"] = {"ray.io/node-id": f"!in({','.join(self._refused)})"}
-        while len(self._hands) < min(self._most or cpus, waiting):
-            actor = self._class.options(**options).remote()
-            self._hands.append(_Hand(actor, actor.hello.remote()))
+        while len(self._actors) < min(self._most or cpus, waiting):
+            handle = self._class.options(**options).remote()
+            self._actors.append(_Actor(handle, handle.hello.remote()))
 
     def _say_waiting(self) -> None:
         """Say once that nothing runs for want of a free CPU."""
         late = time.monotonic() - self._greeted > SAID
-        if late and not self._said and not any(one.node for one in self._hands):
+        if late and not self._said and not any(one.node for one in self._actors):
             self._said = True
             warnings.warn("waiting for a free CPU of the Ray cluster", UserWarning, stacklevel=2)
 
-    def _drop(self, hand: _Hand) -> None:
-        self._hands.remove(hand)
-        self._ray.kill(hand.actor)
+    def _drop(self, actor: _Actor) -> None:
+        self._actors.remove(actor)
+        self._ray.kill(actor.handle)
 
-    def _refuse(self, hand: _Hand, reason: str) -> None:
-        """Stop using the node of a hand, and say so."""
-        assert hand.node is not None
-        line = f"node {hand.address} refuses: {reason}"
-        if hand.node not in self._refused:
+    def _refuse(self, actor: _Actor, reason: str) -> None:
+        """Stop using the node of an actor, and say so."""
+        assert actor.node is not None
+        line = f"node {actor.address} refuses: {reason}"
+        if actor.node not in self._refused:
             warnings.warn(line, UserWarning, stacklevel=2)
-        self._refused[hand.node] = line
+        self._refused[actor.node] = line
         # The node's other actors end what they have accepted, or refuse likewise.
-        self._drop(hand)
+        self._drop(actor)
 
-    def _greet(self, hand: _Hand, there: Mapping[str, Any]) -> None:
-        """Accept a hand that has said hello, if it computes the same."""
-        hand.node, hand.address, hand.at = there["node"], there["address"], None
-        hand.versions = there.get("versions", {})
+    def _greet(self, actor: _Actor, there: Mapping[str, Any]) -> None:
+        """Accept an actor that has said hello, if it computes the same."""
+        actor.node, actor.address, actor.at = there["node"], there["address"], None
+        actor.versions = there.get("versions", {})
         self._greeted = time.monotonic()
-        if hand.node in self._refused:
-            self._drop(hand)
+        if actor.node in self._refused:
+            self._drop(actor)
         elif reason := self._difference(there):
-            self._refuse(hand, reason)
+            self._refuse(actor, reason)
         elif there["key"] not in self._machines:
             self._machines.add(there["key"])
             if self._task.machine is not None:
@@ -269,15 +269,15 @@ class _Sweep:
 
     def _assign(self) -> None:
         """Give specs to idle actors."""
-        for hand in [one for one in self._hands if one.at is None]:
-            if hand.node in self._refused:
-                self._drop(hand)
+        for actor in [one for one in self._actors if one.at is None]:
+            if actor.node in self._refused:
+                self._drop(actor)
             elif self._fresh:
-                self._give(hand, self._fresh.pop())
-            elif self._suspects and hand.node not in {one.node for one in self._busy}:
-                self._give(hand, self._suspects.pop())
+                self._give(actor, self._fresh.pop())
+            elif self._suspects and actor.node not in {one.node for one in self._busy}:
+                self._give(actor, self._suspects.pop())
 
-    def _give(self, hand: _Hand, number: int) -> None:
+    def _give(self, actor: _Actor, number: int) -> None:
         spec, task = self._specs[number], self._task
         order: dict[str, Any] = {
             "call": self._call,
@@ -294,18 +294,18 @@ class _Sweep:
             if not Path(name).is_absolute()
         }
         folder = None if task.folder is None else task.folder(spec)
-        content, hand.folder = None, None
+        content, actor.folder = None, None
         if folder is not None and folder.is_absolute():
-            hand.token = folder / f".here.{secrets.token_hex(4)}.tmp"
+            actor.token = folder / f".here.{secrets.token_hex(4)}.tmp"
             folder.mkdir(parents=True, exist_ok=True)
-            hand.token.touch()
-            order["token"] = str(hand.token)
+            actor.token.touch()
+            order["token"] = str(actor.token)
         elif folder is not None:
             content = dict(shipping.changes(folder, {}).files)
-            hand.folder, hand.known = folder, shipping.digests(content)
-            hand.copied = time.monotonic()
-            order["folder"], order["known"] = str(folder), hand.known
-        hand.number, hand.at = number, hand.actor.run.remote(order, given, content)
+            actor.folder, actor.known = folder, shipping.digests(content)
+            actor.copied = time.monotonic()
+            order["folder"], order["known"] = str(folder), actor.known
+        actor.number, actor.at = number, actor.handle.run.remote(order, given, content)
         if number in self._again:
             self._again.remove(number)
         else:
@@ -316,43 +316,43 @@ class _Sweep:
             self._objects[digest] = self._ray.put(content)
         return self._objects[digest]
 
-    def _hear(self, hand: _Hand) -> list[Result]:
+    def _hear(self, actor: _Actor) -> list[Result]:
         """Take what an actor answers; return the result, if that is one."""
         try:
-            answer = self._ray.get(hand.at)
+            answer = self._ray.get(actor.at)
         except self._ray.exceptions.RayTaskError as error:
             answer = {
                 "kind": "refused",
                 "content": f"{type(error.cause).__name__}: {shortened(error.cause)}",
             }
         except self._ray.exceptions.RayError as error:
-            return self._lose(hand, shortened(error))
-        if hand.number is None:
-            self._greet(hand, answer)
+            return self._lose(actor, shortened(error))
+        if actor.number is None:
+            self._greet(actor, answer)
             return []
-        number = self._finish(hand)
+        number = self._finish(actor)
         if answer["kind"] == "refused":
             self._wait_again(number, self._fresh)
             reason = answer["content"]
             if reason == OTHER_ID:
-                reason += f" ({self._changed(hand.versions) or 'a module of its own differs'})"
-            self._refuse(hand, reason)
+                reason += f" ({self._changed(actor.versions) or 'a module of its own differs'})"
+            self._refuse(actor, reason)
             return []
         if "changes" in answer:
-            self._apply(hand, answer["changes"])
+            self._apply(actor, answer["changes"])
         return self._result(number, answer)
 
     def _wait_again(self, number: int, among: list[int]) -> None:
         among.append(number)
         self._again.add(number)
 
-    def _finish(self, hand: _Hand) -> int:
-        """Take the spec from a hand, and return its number."""
-        assert hand.number is not None
-        number, hand.number, hand.at, hand.copy = hand.number, None, None, None
-        if hand.token is not None:
-            hand.token.unlink(missing_ok=True)
-            hand.token = None
+    def _finish(self, actor: _Actor) -> int:
+        """Take the spec from an actor, and return its number."""
+        assert actor.number is not None
+        number, actor.number, actor.at, actor.copy = actor.number, None, None, None
+        if actor.token is not None:
+            actor.token.unlink(missing_ok=True)
+            actor.token = None
         return number
 
     def _result(self, number: int, answer: Mapping[str, Any]) -> list[Result]:
@@ -369,15 +369,15 @@ class _Sweep:
             return []
         return [pickle.loads(answer["content"])]  # noqa: S301  from a worker of our own
 
-    def _lose(self, hand: _Hand, reason: str) -> list[Result]:
+    def _lose(self, actor: _Actor, reason: str) -> list[Result]:
         """Forget an actor that was lost; its spec runs again elsewhere."""
-        self._hands.remove(hand)
-        if hand.number is None:
+        self._actors.remove(actor)
+        if actor.number is None:
             lately = time.monotonic() - self._greeted < MOST_STARTING
-            if not lately and not any(one.node for one in self._hands):
+            if not lately and not any(one.node for one in self._actors):
                 raise ValueError(f"Ray cannot start workers: {reason}")
             return []
-        number = self._finish(hand)
+        number = self._finish(actor)
         self._losses[number] += 1
         if self._losses[number] == MOST_LOSSES:
             return [self._task.failed(self._specs[number], LOST)]
@@ -389,37 +389,37 @@ class _Sweep:
     def _copy_folders(self) -> None:
         """Ask for the folders of runs that last, so that not all is lost with an actor."""
         now = time.monotonic()
-        for hand in self._busy:
-            if hand.folder is not None and hand.copy is None and now - hand.copied > COPIED:
-                hand.copied = now
-                hand.copy = hand.actor.changes.remote(str(hand.folder), hand.known)
+        for actor in self._busy:
+            if actor.folder is not None and actor.copy is None and now - actor.copied > COPIED:
+                actor.copied = now
+                actor.copy = actor.handle.changes.remote(str(actor.folder), actor.known)
 
-    def _take_copy(self, hand: _Hand) -> None:
-        reference, hand.copy = hand.copy, None
+    def _take_copy(self, actor: _Actor) -> None:
+        reference, actor.copy = actor.copy, None
         # An actor that was lost is noticed by what it runs.
         with contextlib.suppress(self._ray.exceptions.RayError):
-            self._apply(hand, self._ray.get(reference))
+            self._apply(actor, self._ray.get(reference))
 
-    def _apply(self, hand: _Hand, changed: shipping.Changes) -> None:
-        assert hand.folder is not None
-        hand.known = shipping.apply(hand.folder, changed, hand.known)
+    def _apply(self, actor: _Actor, changed: shipping.Changes) -> None:
+        assert actor.folder is not None
+        actor.known = shipping.apply(actor.folder, changed, actor.known)
 
     def end(self) -> None:
         """End all actors; folders of interrupted runs are brought back before."""
-        away = [hand for hand in self._busy if hand.folder is not None]
-        for hand in away:
-            hand.actor.end.remote()
+        away = [actor for actor in self._busy if actor.folder is not None]
+        for actor in away:
+            actor.handle.end.remote()
         if away:
-            self._ray.wait([hand.at for hand in away], num_returns=len(away), timeout=RETURNED)
-        for hand in away:
+            self._ray.wait([actor.at for actor in away], num_returns=len(away), timeout=RETURNED)
+        for actor in away:
             with contextlib.suppress(self._ray.exceptions.RayError):
-                answer = self._ray.get(hand.at, timeout=0)
+                answer = self._ray.get(actor.at, timeout=0)
                 if "changes" in answer:
-                    self._apply(hand, answer["changes"])
-        for hand in self._busy:
-            self._finish(hand)
-        closed = [hand.actor.close.remote() for hand in self._hands if hand.node is not None]
+                    self._apply(actor, answer["changes"])
+        for actor in self._busy:
+            self._finish(actor)
+        closed = [actor.handle.close.remote() for actor in self._actors if actor.node is not None]
         if closed:
             self._ray.wait(closed, num_returns=len(closed), timeout=PATIENCE)
-        for hand in [*self._hands]:
-            self._drop(hand)
+        for actor in [*self._actors]:
+            self._drop(actor)
